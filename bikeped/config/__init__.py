@@ -1,0 +1,55 @@
+"""The whole configuration, as typed sections: load, check, override, hash."""
+
+from bikeped.config.build import framing, ground_camera, rule_settings, tracker_settings
+from bikeped.config.calibration import Calibration, load_calibration
+from bikeped.config.load import (
+    LoadedConfig,
+    config_hash,
+    default_config_path,
+    known_keys,
+    load_config,
+    parse_config,
+)
+from bikeped.config.sections import (
+    AuditConfig,
+    CameraConfig,
+    Config,
+    DecisionConfig,
+    DetectionConfig,
+    FeedbackConfig,
+    GpioConfig,
+    LatencyConfig,
+    MqttConfig,
+    SoundConfig,
+    TrackingConfig,
+    UsbConfig,
+    WebConfig,
+)
+
+__all__ = [
+    "AuditConfig",
+    "Calibration",
+    "CameraConfig",
+    "Config",
+    "DecisionConfig",
+    "DetectionConfig",
+    "FeedbackConfig",
+    "GpioConfig",
+    "LatencyConfig",
+    "LoadedConfig",
+    "MqttConfig",
+    "SoundConfig",
+    "TrackingConfig",
+    "UsbConfig",
+    "WebConfig",
+    "config_hash",
+    "default_config_path",
+    "framing",
+    "ground_camera",
+    "known_keys",
+    "load_calibration",
+    "load_config",
+    "parse_config",
+    "rule_settings",
+    "tracker_settings",
+]

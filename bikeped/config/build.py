@@ -1,0 +1,106 @@
+"""From configuration sections to the settings of the pure core.
+
+Settings in nominal frames become seconds here, once.
+"""
+
+from __future__ import annotations
+
+import math
+
+from bikeped.config.load import LoadedConfig
+from bikeped.config.sections import DecisionConfig, TrackingConfig
+from bikeped.decision import RuleSettings
+from bikeped.errors import ConfigError, GeometryError
+from bikeped.geometry import Framing, GroundCamera, Lens, canonical_projection
+from bikeped.tracking import TrackerSettings
+
+
+def rule_settings(decision: DecisionConfig) -> RuleSettings:
+    """The decision's parameters in seconds.
+
+    Speed is the displacement over the last 4 positions (definitions, section 8): 3 nominal frames.
+    """
+    fps = decision.nominal_fps
+    return RuleSettings(
+        rule=decision.rule,
+        memory_s=decision.memory_frames / fps,
+        d_min_m=decision.d_min_m,
+        d_max_m=decision.d_max_m,
+        min_displacement_m=decision.min_displacement_m,
+        lookback_s=decision.lookback_frames / fps,
+        max_range_m=decision.max_range_m,
+        speed_adaptive=decision.speed_adaptive,
+        reaction_s=decision.reaction_s,
+        deceleration_mps2=decision.deceleration_mps2,
+        speed_window_s=3 / fps,
+        ttc_s=decision.ttc_s,
+    )
+
+
+def tracker_settings(tracking: TrackingConfig, nominal_fps: float = 30.0) -> TrackerSettings:
+    """The tracker's parameters."""
+    return TrackerSettings(
+        match_radius_m=tracking.match_radius_m,
+        max_unseen_s=tracking.max_unseen_s,
+        velocity_weight=tracking.velocity_weight,
+        frame_s=1 / nominal_fps,
+        confirm_hits=tracking.confirm_hits,
+        max_speed_mps=(
+            tracking.max_speed_pedestrian_mps,
+            tracking.max_speed_cyclist_mps,
+            tracking.max_speed_vehicle_mps,
+        ),
+        position_noise_m=tracking.position_noise_m,
+        unbiased=True,
+    )
+
+
+def framing(loaded: LoadedConfig) -> Framing:
+    """How the sensor image lies in the crop; ConfigError when it cannot."""
+    camera = loaded.config.camera
+    try:
+        return Framing(camera.width, camera.height, camera.pad_size, camera.crop_size)
+    except GeometryError as error:
+        raise ConfigError(f"{loaded.source}: {error}") from error
+
+
+def ground_camera(loaded: LoadedConfig) -> GroundCamera:
+    """The camera above the ground: calibration, overridden by the keys of the camera section.
+
+    `radius_px` (with `fov_deg`) gives the focal length when it is set, as the installer measures
+    it; else the calibration's focal length holds.
+    """
+    camera, calibration = loaded.config.camera, loaded.calibration
+    frame = framing(loaded)
+    width, height = frame.crop_wh
+    try:
+        if calibration is None:
+            name = canonical_projection(camera.projection or "equidistant")
+            measured_k: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+            cx, cy = (width - 1) / 2, (height - 1) / 2
+        else:
+            name = canonical_projection(camera.projection or calibration.model)
+            measured_k = (calibration.k1, calibration.k2, calibration.k3, calibration.k4)
+            cx, cy = calibration.cx, calibration.cy
+        set_k = (camera.k1, camera.k2, camera.k3, camera.k4)
+        k1, k2, k3, k4 = (m if s is None else s for m, s in zip(measured_k, set_k, strict=True))
+        fov = camera.fov_deg or (calibration.fov_deg if calibration else None)
+        if fov is None:
+            raise GeometryError("camera.fov_deg: missing; set the field of view in degrees")
+        if camera.radius_px is not None:
+            lens = Lens.from_circle(name, camera.radius_px, fov, (k1, k2, k3, k4))
+        elif calibration is not None:
+            lens = Lens(name, calibration.focal_length, math.radians(fov) / 2, (k1, k2, k3, k4))
+        else:
+            raise GeometryError("camera.radius_px: missing; set the image circle's radius")
+        return GroundCamera(
+            lens=lens,
+            cx=cx if camera.cx is None else camera.cx,
+            cy=cy if camera.cy is None else camera.cy,
+            height_m=camera.height_m,
+            pitch_deg=camera.pitch_deg,
+            heading_deg=camera.heading_deg,
+            window_px=frame.window_px,
+        )
+    except GeometryError as error:
+        raise ConfigError(f"{loaded.source}: camera: {error}") from error

@@ -1,0 +1,317 @@
+"""Reading, overriding, checking and hashing a configuration."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import yaml
+
+from bikeped.config.calibration import Calibration, load_calibration
+from bikeped.config.sections import Config
+from bikeped.errors import ConfigError
+
+_MAX_BYTES = 1_000_000
+_MAX_NODES = 100_000
+
+
+@dataclass(frozen=True)
+class LoadedConfig:
+    """A checked configuration with what it was made from.
+
+    `source` names it in messages; relative paths in it start at `base_dir`. `hash` covers every
+    effective value, `calibration_hash` the calibration file's bytes (None without one).
+    """
+
+    config: Config
+    source: str
+    base_dir: Path
+    hash: str
+    calibration: Calibration | None
+    calibration_hash: str | None
+
+    def path(self, relative: str) -> Path:
+        """A path of the configuration, resolved against the folder of its file."""
+        return (self.base_dir / Path(relative).expanduser()).absolute()
+
+
+def default_config_path() -> Path:
+    """`config.yaml` in the working directory, or else the one that comes with bikeped."""
+    here = Path("config.yaml")
+    if here.is_file():
+        return here
+    package = Path(__file__).parent.parent
+    bundled = package / "default" / "config.yaml"
+    return bundled if bundled.is_file() else package.parent / "config.yaml"
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> LoadedConfig:
+    """Reads a configuration file, applies `SECTION.KEY=VALUE` overrides and checks all of it.
+
+    Raises ConfigError (or CalibrationError) with one line naming the file, the key and the mend.
+    Paths given by an override are relative to the working directory, as a person would type them.
+    """
+    file = path if path is not None else default_config_path()
+    try:
+        if file.stat().st_size > _MAX_BYTES:
+            raise ConfigError(f"{file}: larger than 1 MB; a configuration is a short text")
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"{file}: cannot be read ({error.strerror}); give a configuration with -c"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file}: is not UTF-8 text; save it as UTF-8") from error
+    return parse_config(text, str(file), file.parent, overrides)
+
+
+def parse_config(
+    text: str, source: str, base_dir: Path, overrides: Sequence[str] = ()
+) -> LoadedConfig:
+    """A configuration from YAML text; see `load_config`."""
+    data = _yaml_mapping(text, source)
+    for override in overrides:
+        _apply(data, override)
+    where = source if not overrides else f"{source} with --set"
+    try:
+        config = msgspec.convert(data, Config, strict=True)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{where}: {_explain(error, data)}") from error
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise ConfigError(f"{where}: {error}; see bikeped config schema") from error
+    _cross_check(config, where)
+    calibration, calibration_hash = None, None
+    if config.camera.calibration is not None:
+        file = base_dir / Path(config.camera.calibration).expanduser()
+        calibration, calibration_hash = load_calibration(file)
+        _check_fit(config, calibration, str(file))
+    return LoadedConfig(
+        config=config,
+        source=source,
+        base_dir=base_dir,
+        hash=config_hash(config, calibration_hash),
+        calibration=calibration,
+        calibration_hash=calibration_hash,
+    )
+
+
+def config_hash(config: Config, calibration_hash: str | None = None) -> str:
+    """SHA-256 over every effective value and the calibration, independent of how it was written."""
+    digest = hashlib.sha256(msgspec.json.encode(config, order="deterministic"))
+    digest.update((calibration_hash or "").encode())
+    return digest.hexdigest()
+
+
+def _yaml_mapping(text: str, source: str) -> dict[str, Any]:
+    try:
+        _refuse_blow_up(text, source)
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark is not None else ""
+        what = getattr(error, "problem", None) or "cannot be read"
+        raise ConfigError(
+            f"{source}{where}: is not YAML ({what}); check the indentation"
+        ) from error
+    except (ValueError, OverflowError, RecursionError, TypeError) as error:
+        raise ConfigError(f"{source}: is not a usable YAML value ({error}); simplify it") from error
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{source}: expected sections such as camera: and decision: at the top")
+    return data
+
+
+def _refuse_blow_up(text: str, source: str) -> None:
+    """Refuses aliases: a few lines of them can stand for gigabytes, and nobody needs them here."""
+    for nodes, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
+        if isinstance(event, yaml.AliasEvent) or nodes > _MAX_NODES:
+            mark = event.start_mark
+            raise ConfigError(
+                f"{source}, line {mark.line + 1 if mark else '?'}: YAML aliases are not allowed; "
+                "write the value out"
+            )
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or len(parts) < 2 or not all(parts):
+        raise ConfigError(
+            f"--set {override}: expected SECTION.KEY=VALUE, e.g. --set decision.d_max_m=20"
+        )
+    try:
+        value = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"--set {override}: the value is not YAML; quote it") from error
+    if key.strip() in _PATH_KEYS and isinstance(value, str) and value:
+        value = str(Path(value).expanduser().absolute())
+    node = data
+    for part in parts[:-1]:
+        child = node.get(part)
+        if child is None:
+            child = node[part] = {}
+        if not isinstance(child, dict):
+            raise ConfigError(f"--set {override}: {part} is not a section")
+        node = child
+    node[parts[-1]] = value
+
+
+_PATH_KEYS = frozenset(
+    {
+        "camera.calibration",
+        "detection.model",
+        "detection.engine_cache",
+        "feedback.sound.chime",
+        "feedback.sound.bell",
+        "mqtt.password_file",
+        "mqtt.ca_file",
+        "mqtt.cert_file",
+        "mqtt.key_file",
+        "audit.path",
+    }
+)
+
+
+def known_keys(struct: type[msgspec.Struct] = Config, prefix: str = "") -> Iterable[str]:
+    """Every key as `section.key`, nested sections included."""
+    for item in msgspec.structs.fields(struct):
+        name = f"{prefix}{item.name}"
+        if isinstance(item.type, type) and issubclass(item.type, msgspec.Struct):
+            yield from known_keys(item.type, f"{name}.")
+        else:
+            yield name
+
+
+def _section_names(path: str) -> list[str]:
+    """Names that may stand at `$.a.b`."""
+    struct: type[msgspec.Struct] = Config
+    for part in [p for p in path.removeprefix("$").split(".") if p]:
+        kinds = {f.name: f.type for f in msgspec.structs.fields(struct)}
+        kind = kinds.get(part)
+        if not (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
+            return []
+        struct = kind
+    return [f.name for f in msgspec.structs.fields(struct)]
+
+
+def _explain(error: msgspec.ValidationError, data: dict[str, Any]) -> str:
+    """msgspec's message as key, what is wrong, and the mend."""
+    text = str(error)
+    body, _, path = text.partition(" - at `")
+    path = path.rstrip("`")
+    unknown = re.match(r"Object contains unknown field `(.*)`$", body, re.DOTALL)
+    if unknown:
+        name = unknown.group(1)
+        section = path.removeprefix("$").removeprefix(".")
+        names = _section_names(path)
+        near = difflib.get_close_matches(name, names, 1, 0.5)
+        elsewhere = [k for k in known_keys() if k.split(".")[-1] == name]
+        if near:
+            mend = f"did you mean {near[0]}?"
+        elif elsewhere:
+            mend = f"did you mean {elsewhere[0]}?"
+        else:
+            mend = f"known here: {', '.join(names)}"
+        key = _one_line(f"{section}.{name}" if section else name)
+        return f"{key}: unknown key; {mend}"
+    if path.startswith("key` in"):
+        return f"{_one_line(path[8:])}: a key is not text; keys are words such as camera"
+    key = path.removeprefix("$").removeprefix(".")
+    value = _value_at(data, key)
+    got = f" (got {_one_line(repr(value))})" if value is not None else ""
+    label = _one_line(key) or "top level"
+    mend = _allowed(key) or "see bikeped config schema"
+    return f"{label}: {_one_line(body[:1].lower() + body[1:])}{got}; {mend}"
+
+
+def _allowed(key: str) -> str:
+    """The values that a key takes, in words; empty where the schema has no short answer."""
+    _, parts = msgspec.json.schema_components([Config], ref_template="{name}")
+    node: dict[str, Any] = parts["Config"]
+    for name in key.split("."):
+        item = node.get("properties", {}).get(name)
+        if item is None:
+            return ""
+        reference = item.get("$ref") or next(
+            (a["$ref"] for a in item.get("allOf", item.get("anyOf", ())) if "$ref" in a), None
+        )
+        node = parts[reference] if reference in parts else item
+    choices = [node, *node.get("anyOf", ())]
+    names = [str(n) for c in choices for n in c.get("enum", ()) if n is not None]
+    if names:
+        return f"use one of {', '.join(names)}"
+    for choice in choices:
+        low = choice.get("minimum", choice.get("exclusiveMinimum"))
+        high = choice.get("maximum")
+        if low is not None and high is not None:
+            above = "above " if "exclusiveMinimum" in choice else ""
+            return f"use a value {above}{low:g} to {high:g}"
+    return ""
+
+
+def _one_line(text: str) -> str:
+    flat = " ".join(text.split())
+    return flat if len(flat) <= 80 else flat[:77] + "..."
+
+
+def _value_at(data: Any, key: str) -> Any:
+    node = data
+    for part in key.split("."):
+        if not isinstance(node, dict) or part not in node:
+            return None
+        node = node[part]
+    return node
+
+
+def _cross_check(config: Config, where: str) -> None:
+    """What no single key can say."""
+    decision, camera, mqtt = config.decision, config.camera, config.mqtt
+    if decision.d_min_m > decision.d_max_m:
+        raise ConfigError(
+            f"{where}: decision.d_min_m: {decision.d_min_m:g} is above decision.d_max_m "
+            f"{decision.d_max_m:g}; exchange them"
+        )
+    if (camera.radius_px is None) != (camera.fov_deg is None) and camera.calibration is None:
+        raise ConfigError(
+            f"{where}: camera.radius_px and camera.fov_deg: without a calibration both are "
+            "needed, for they give the focal length; set both"
+        )
+    if camera.calibration is None and camera.radius_px is None:
+        raise ConfigError(
+            f"{where}: camera.calibration: missing; name a calibration file, or set "
+            "camera.radius_px and camera.fov_deg"
+        )
+    if (mqtt.cert_file is None) != (mqtt.key_file is None):
+        raise ConfigError(
+            f"{where}: mqtt.cert_file and mqtt.key_file: one without the other; set both"
+        )
+
+
+def _check_fit(config: Config, calibration: Calibration, file: str) -> None:
+    """A calibration speaks of one framing only."""
+    camera = config.camera
+    for key, measured, configured in (
+        ("crop_size", calibration.crop_size, camera.crop_size),
+        ("pad_size", calibration.pad_size, camera.pad_size),
+        ("width", calibration.frame_width, camera.width),
+        ("height", calibration.frame_height, camera.height),
+    ):
+        if measured is not None and measured != configured:
+            raise ConfigError(
+                f"{file}: does not fit: camera.{key} is {configured}, the calibration was made "
+                f"with {measured}; set camera.{key}: {measured} or calibrate again"
+            )
+    if camera.crop_size is not None and not (
+        0 <= calibration.cx <= camera.crop_size and 0 <= calibration.cy <= camera.crop_size
+    ):
+        raise ConfigError(
+            f"{file}: does not fit: centre ({calibration.cx:g}, {calibration.cy:g}) lies outside "
+            f"the crop of {camera.crop_size} px; calibrate again with this crop"
+        )

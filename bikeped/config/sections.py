@@ -1,0 +1,545 @@
+"""Every key of `config.yaml`: its type, range, default and meaning.
+
+The descriptions here are the source of `docs/configuration.md` and of `bikeped config schema`.
+Values that the paper gives in frames stay in frames here (people know them so) and are turned into
+seconds once, at `decision.nominal_fps`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+# Finite by construction: msgspec refuses NaN only where a bound is given, so every float has one.
+Metres = Annotated[float, Meta(ge=0, le=1000)]
+Seconds = Annotated[float, Meta(ge=0, le=3600)]
+Ratio = Annotated[float, Meta(ge=0, le=1)]
+Radial = Annotated[float, Meta(ge=-10, le=10)]
+Projection = Literal[
+    "equidistant",
+    "equisolid",
+    "stereographic",
+    "orthographic",
+    "perspective",
+    "linear",
+    "equalarea",
+]
+
+
+class _Section(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=False
+):
+    """Base of all sections: immutable, no unknown keys."""
+
+
+class CameraConfig(_Section, frozen=True):
+    """The camera: where pictures come from, its lens, and how it hangs."""
+
+    source: Annotated[
+        str,
+        Meta(
+            min_length=1,
+            description="V4L2 device, video file, folder of images, or rtsp:// or http:// address",
+        ),
+    ] = "/dev/video0"
+    width: Annotated[
+        int, Meta(ge=16, le=16384, description="sensor width asked of the camera, pixels")
+    ] = 3840
+    height: Annotated[
+        int, Meta(ge=16, le=16384, description="sensor height asked of the camera, pixels")
+    ] = 2160
+    fps: Annotated[
+        float, Meta(ge=1, le=240, description="frame rate asked of the camera, frames per second")
+    ] = 30.0
+    fourcc: Annotated[
+        str,
+        Meta(
+            min_length=4,
+            max_length=4,
+            description="V4L2 pixel format; MJPG is passed undecoded",
+        ),
+    ] = "MJPG"
+    calibration: Annotated[
+        str | None,
+        Meta(
+            description="calibration file with projection, centre, focal length and radial terms, "
+            "relative to this file; null uses only the keys below"
+        ),
+    ] = None
+    projection: Annotated[
+        Projection | None,
+        Meta(
+            description="lens model; linear is equidistant, equalarea is equisolid, perspective is "
+            "an ordinary lens; null takes the calibration's, or else equidistant"
+        ),
+    ] = None
+    fov_deg: Annotated[
+        Annotated[float, Meta(gt=0, le=300)] | None,
+        Meta(description="field of view, degrees; null takes the calibration's"),
+    ] = None
+    radius_px: Annotated[
+        Annotated[float, Meta(gt=0, le=100000)] | None,
+        Meta(
+            description="image circle radius at the edge of the field of view, crop pixels; gives "
+            "the focal length; null takes the calibration's focal length",
+        ),
+    ] = None
+    cx: Annotated[
+        Annotated[float, Meta(ge=-100000, le=100000)] | None,
+        Meta(
+            description="optical centre u in the crop, pixels; null takes the calibration's, or "
+            "else the middle",
+        ),
+    ] = None
+    cy: Annotated[
+        Annotated[float, Meta(ge=-100000, le=100000)] | None,
+        Meta(
+            description="optical centre v in the crop, pixels; null takes the calibration's, or "
+            "else the middle",
+        ),
+    ] = None
+    k1: Annotated[Radial | None, Meta(description="radial term of theta^3; null: calibration")] = (
+        None
+    )
+    k2: Annotated[Radial | None, Meta(description="radial term of theta^5; null: calibration")] = (
+        None
+    )
+    k3: Annotated[Radial | None, Meta(description="radial term of theta^7; null: calibration")] = (
+        None
+    )
+    k4: Annotated[Radial | None, Meta(description="radial term of theta^9; null: calibration")] = (
+        None
+    )
+    pad_size: Annotated[
+        Annotated[int, Meta(ge=16, le=32768)] | None,
+        Meta(
+            description="side of the black square that the frame is centred in, pixels; null: none",
+        ),
+    ] = 3840
+    crop_size: Annotated[
+        Annotated[int, Meta(ge=16, le=32768)] | None,
+        Meta(
+            description="side of the square cut from its middle, pixels; null: none",
+        ),
+    ] = 3500
+    height_m: Annotated[
+        float, Meta(gt=0, le=100, description="height of the lens above the ground, metres")
+    ] = 3.6576
+    pitch_deg: Annotated[
+        float,
+        Meta(ge=-90, le=90, description="pitch, degrees; 0 is level, negative looks down"),
+    ] = 0.0
+    heading_deg: Annotated[
+        float,
+        Meta(
+            ge=-360,
+            le=360,
+            description="turns the ground frame to the right of the optical axis, degrees; 0 keeps "
+            "x forward",
+        ),
+    ] = 0.0
+    table_step_px: Annotated[
+        int,
+        Meta(ge=1, le=64, description="spacing of the ground table's lattice, crop pixels"),
+    ] = 8
+    stale_after_s: Annotated[
+        float,
+        Meta(
+            gt=0, le=60, description="no frame for this long is a FAULT and a new capture, seconds"
+        ),
+    ] = 0.5
+    hang_after_s: Annotated[
+        float,
+        Meta(
+            ge=1,
+            le=600,
+            description="a read that has not returned for this long ends the process, so that "
+            "systemd starts a fresh one, seconds",
+        ),
+    ] = 15.0
+
+
+class DetectionConfig(_Section, frozen=True):
+    """The detector: the model file, its layout, and what is kept of its answer."""
+
+    model: Annotated[
+        str | None,
+        Meta(description="model file, .onnx or .engine, relative to this file; null: none"),
+    ] = None
+    sha256: Annotated[
+        Annotated[str, Meta(pattern="^[0-9a-fA-F]{64}$")] | None,
+        Meta(
+            description="SHA-256 of the model file, refused when different; null: any",
+        ),
+    ] = None
+    layout: Annotated[
+        Literal["auto", "yolov5", "yolov8", "end2end", "yolox", "yolox-decoded"],
+        Meta(
+            description="output layout: yolov5 also v7; yolov8 also v9, v11, v12; end2end also v10 "
+            "and 26; auto tells them apart by metadata and shapes"
+        ),
+    ] = "auto"
+    preprocess: Annotated[
+        Literal["auto", "ultralytics", "yolox", "yolox-legacy"],
+        Meta(
+            description="ultralytics: RGB/255, centred letterbox; yolox: BGR 0..255, top-left; "
+            "yolox-legacy (before 0.1.1): RGB/255, ImageNet mean and deviation, top-left"
+        ),
+    ] = "auto"
+    confidence: Annotated[
+        float, Meta(ge=0.001, le=1, description="smallest confidence that is kept")
+    ] = 0.1
+    iou: Annotated[
+        float,
+        Meta(ge=0.01, le=1, description="overlap above which the weaker of one class is dropped"),
+    ] = 0.45
+    max_detections: Annotated[
+        int, Meta(ge=1, le=10000, description="most detections kept of one frame")
+    ] = 300
+    pedestrian: Annotated[
+        tuple[str, ...], Meta(description="model class names that are pedestrians")
+    ] = ("person", "pedestrian")
+    cyclist: Annotated[tuple[str, ...], Meta(description="model class names that are cyclists")] = (
+        "bicycle",
+        "motorcycle",
+        "cyclist",
+    )
+    vehicle: Annotated[tuple[str, ...], Meta(description="model class names that are vehicles")] = (
+        "car",
+        "bus",
+        "truck",
+        "vehicle",
+    )
+    rider_overlap: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="share of a person's box, from the waist down, that a cyclist's box must "
+            "cover for the two to be one rider; 1 never joins them",
+        ),
+    ] = 0.4
+    providers: Annotated[
+        tuple[Literal["tensorrt", "cuda", "cpu"], ...],
+        Meta(
+            min_length=1,
+            description="ONNX Runtime execution providers in order; those not present are skipped",
+        ),
+    ] = ("tensorrt", "cuda", "cpu")
+    engine_cache: Annotated[
+        str, Meta(min_length=1, description="folder for TensorRT engines built from ONNX")
+    ] = "~/.cache/bikeped/engines"
+    threads: Annotated[
+        int, Meta(ge=0, le=256, description="CPU threads for inference; 0 lets the runtime choose")
+    ] = 0
+    silent_after_s: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=60,
+            description="no detector answer for this long is a FAULT, seconds",
+        ),
+    ] = 0.5
+
+
+class TrackingConfig(_Section, frozen=True):
+    """The tracker, in ground metres."""
+
+    match_radius_m: Annotated[
+        float, Meta(gt=0, le=50, description="farthest that a detection may lie from its track, m")
+    ] = 3.0
+    max_unseen_s: Annotated[
+        float,
+        Meta(ge=0, le=60, description="an unseen track coasts at constant velocity this long, s"),
+    ] = 10.0
+    velocity_weight: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1,
+            description="weight of the newest step in the smoothed velocity, per nominal frame",
+        ),
+    ] = 0.5
+    speed_window_frames: Annotated[
+        int,
+        Meta(ge=1, le=60, description="reported velocity is the displacement over these frames"),
+    ] = 4
+    history_frames: Annotated[
+        int, Meta(ge=2, le=300, description="positions kept and published of each track")
+    ] = 30
+    confirm_hits: Annotated[
+        int, Meta(ge=1, le=30, description="matches before a track counts as present")
+    ] = 2
+    max_range_m: Annotated[
+        float,
+        Meta(gt=0, le=1000, description="detections farther from the camera are not tracked, m"),
+    ] = 60.0
+    max_speed_pedestrian_mps: Annotated[
+        float, Meta(gt=0, le=100, description="speed gate of pedestrians, m/s")
+    ] = 6.0
+    max_speed_cyclist_mps: Annotated[
+        float, Meta(gt=0, le=100, description="speed gate of cyclists, m/s")
+    ] = 20.0
+    max_speed_vehicle_mps: Annotated[
+        float, Meta(gt=0, le=100, description="speed gate of vehicles, m/s")
+    ] = 40.0
+    position_noise_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=10,
+            description="measurement noise that the speed gate allows on top of the speed, m",
+        ),
+    ] = 0.75
+
+
+class DecisionConfig(_Section, frozen=True):
+    """The three-stage rule. The defaults are the paper's selected configuration."""
+
+    rule: Annotated[
+        Literal["pairwise", "naive", "ttc", "distance"],
+        Meta(description="closing check: the paper's pairwise one, or a baseline"),
+    ] = "pairwise"
+    memory_frames: Annotated[
+        int,
+        Meta(ge=0, le=3000, description="N: a cyclist is remembered this many nominal frames"),
+    ] = 58
+    d_min_m: Annotated[
+        float, Meta(ge=0, le=100, description="nearest pair distance that can alert, m")
+    ] = 1.9
+    d_max_m: Annotated[
+        float, Meta(gt=0, le=100, description="farthest pair distance that can alert, m")
+    ] = 24.8
+    min_displacement_m: Annotated[
+        float,
+        Meta(ge=0, le=10, description="least way of the cyclist over the lookback that counts, m"),
+    ] = 0.147
+    lookback_frames: Annotated[
+        int, Meta(ge=1, le=60, description="k: the lookback, in nominal frames")
+    ] = 2
+    max_range_m: Annotated[
+        float,
+        Meta(gt=0, le=1000, description="pairs farther from the camera are not judged, m"),
+    ] = 25.0
+    speed_adaptive: Annotated[
+        bool, Meta(description="raise d_max to the cyclist's stopping distance")
+    ] = True
+    reaction_s: Annotated[
+        float, Meta(ge=0, le=10, description="cyclist's reaction time in the stopping distance, s")
+    ] = 0.84
+    deceleration_mps2: Annotated[
+        float,
+        Meta(gt=0, le=20, description="cyclist's deceleration in the stopping distance, m/s^2"),
+    ] = 1.96
+    ttc_s: Annotated[
+        float, Meta(gt=0, le=60, description="time to collision below which rule ttc fires, s")
+    ] = 3.0
+    nominal_fps: Annotated[
+        float,
+        Meta(ge=1, le=240, description="turns settings in frames into seconds, once"),
+    ] = 30.0
+
+
+class GpioConfig(_Section, frozen=True):
+    """A light on GPIO lines."""
+
+    chip: Annotated[
+        str, Meta(min_length=1, description="chip by label, name or path, e.g. tegra234-gpio")
+    ] = "tegra234-gpio"
+    red: Annotated[str | int | None, Meta(description="line name or offset; null: not wired")] = (
+        None
+    )
+    orange: Annotated[
+        str | int | None, Meta(description="line name or offset; null: not wired")
+    ] = None
+    green: Annotated[str | int | None, Meta(description="line name or offset; null: not wired")] = (
+        None
+    )
+    blue: Annotated[str | int | None, Meta(description="line name or offset; null: not wired")] = (
+        None
+    )
+    active_low: Annotated[bool, Meta(description="a low line lights the lamp")] = False
+
+
+class UsbConfig(_Section, frozen=True):
+    """A USB light or relay board."""
+
+    device: Annotated[
+        Literal["blink1", "luxafor", "relay"],
+        Meta(
+            description="blink1: ThingM blink(1); luxafor: Luxafor Flag; relay: HID relay board "
+            "16c0:05df, one relay a colour"
+        ),
+    ] = "relay"
+    serial: Annotated[
+        str | None, Meta(description="serial number when several are plugged in; null: first")
+    ] = None
+    relay_red: Annotated[int, Meta(ge=0, le=8, description="relay of red; 0: not wired")] = 1
+    relay_orange: Annotated[int, Meta(ge=0, le=8, description="relay of orange; 0: not wired")] = 2
+    relay_green: Annotated[int, Meta(ge=0, le=8, description="relay of green; 0: not wired")] = 3
+    relay_blue: Annotated[int, Meta(ge=0, le=8, description="relay of blue; 0: not wired")] = 4
+
+
+class SoundConfig(_Section, frozen=True):
+    """The speaker."""
+
+    enabled: Annotated[bool, Meta(description="play chime and bell")] = False
+    device: Annotated[str, Meta(min_length=1, description="ALSA device, as aplay -D takes it")] = (
+        "default"
+    )
+    volume: Annotated[Ratio, Meta(description="0 is silent, 1 is full scale")] = 0.8
+    chime: Annotated[str | None, Meta(description="WAV file of the chime; null: bikeped's own")] = (
+        None
+    )
+    bell: Annotated[str | None, Meta(description="WAV file of the bell; null: bikeped's own")] = (
+        None
+    )
+    chime_cooldown_s: Annotated[
+        float, Meta(ge=0, le=3600, description="shortest time between two chimes, seconds")
+    ] = 5.0
+    bell_cooldown_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=3600,
+            description="shortest time between two bells; while ALERT lasts the bell repeats, s",
+        ),
+    ] = 1.5
+
+
+class FeedbackConfig(_Section, frozen=True):
+    """The light and the speaker."""
+
+    light: Annotated[
+        Literal["simulated", "gpio", "usb"],
+        Meta(description="simulated writes to the log"),
+    ] = "simulated"
+    blink_hz: Annotated[
+        float, Meta(gt=0, le=10, description="blinking of ALERT's red, flashes per second")
+    ] = 2.0
+    fault_blink_hz: Annotated[
+        float,
+        Meta(gt=0, le=10, description="blinking of FAULT's orange, flashes per second"),
+    ] = 0.5
+    hold_alert_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=10,
+            description="the light keeps ALERT at least this long, so that one frame is seen, s",
+        ),
+    ] = 1.0
+    recover_frames: Annotated[
+        int,
+        Meta(ge=1, le=300, description="good frames in a row before the light leaves FAULT"),
+    ] = 5
+    gpio: GpioConfig = msgspec.field(default_factory=GpioConfig)
+    usb: UsbConfig = msgspec.field(default_factory=UsbConfig)
+    sound: SoundConfig = msgspec.field(default_factory=SoundConfig)
+
+
+class MqttConfig(_Section, frozen=True):
+    """Telemetry."""
+
+    enabled: Annotated[bool, Meta(description="publish to the broker")] = False
+    host: Annotated[str, Meta(min_length=1, description="broker's name or address")] = "localhost"
+    port: Annotated[int, Meta(ge=1, le=65535, description="broker's port")] = 1883
+    site: Annotated[
+        str,
+        Meta(
+            pattern="^[^/+#\\x00]+$",
+            max_length=64,
+            description="the <site> of the topics bikeped/<site>/...",
+        ),
+    ] = "crossing"
+    qos: Annotated[int, Meta(ge=0, le=2, description="quality of service of state and health")] = 1
+    publish_interval_s: Annotated[
+        float, Meta(ge=0.01, le=3600, description="time between two track messages, seconds")
+    ] = 0.1
+    health_interval_s: Annotated[
+        float, Meta(ge=0.1, le=3600, description="time between two health messages, seconds")
+    ] = 10.0
+    keepalive_s: Annotated[int, Meta(ge=1, le=3600, description="MQTT keep-alive, seconds")] = 15
+    username: Annotated[str | None, Meta(description="user name; null: none")] = None
+    password_file: Annotated[
+        str | None, Meta(description="file whose first line is the password; null: none")
+    ] = None
+    tls: Annotated[bool, Meta(description="encrypt the connection")] = False
+    ca_file: Annotated[str | None, Meta(description="CA certificates; null: the system's")] = None
+    cert_file: Annotated[str | None, Meta(description="client certificate; null: none")] = None
+    key_file: Annotated[str | None, Meta(description="key of the client certificate")] = None
+    home_assistant: Annotated[
+        bool, Meta(description="announce the entities for Home Assistant's discovery")
+    ] = False
+    discovery_prefix: Annotated[
+        str, Meta(min_length=1, description="Home Assistant's discovery prefix")
+    ] = "homeassistant"
+
+
+class WebConfig(_Section, frozen=True):
+    """The HTTP server."""
+
+    enabled: Annotated[bool, Meta(description="serve /metrics and /healthz")] = False
+    host: Annotated[str, Meta(min_length=1, description="address to bind")] = "127.0.0.1"
+    port: Annotated[int, Meta(ge=0, le=65535, description="port to bind; 0: any free one")] = 8080
+
+
+class AuditConfig(_Section, frozen=True):
+    """The audit log: one JSON line a frame."""
+
+    path: Annotated[str | None, Meta(description="file to append to; null writes no audit log")] = (
+        None
+    )
+    max_mb: Annotated[
+        float, Meta(ge=0.01, le=100000, description="size at which the file is rotated, MB")
+    ] = 100.0
+    keep: Annotated[int, Meta(ge=1, le=1000, description="rotated files that are kept")] = 10
+    min_free_mb: Annotated[
+        float,
+        Meta(ge=0, le=1000000, description="nothing is written with less free disk than this, MB"),
+    ] = 500.0
+
+
+class LatencyConfig(_Section, frozen=True):
+    """Compensation of the time between capture and decision."""
+
+    compensation: Annotated[
+        Literal["off", "measured", "frames"],
+        Meta(
+            description="off; predict ahead by the measured capture age; or by a fixed number of "
+            "frames"
+        ),
+    ] = "off"
+    frames: Annotated[
+        int, Meta(ge=0, le=60, description="nominal frames to predict ahead with frames")
+    ] = 0
+    order: Annotated[
+        Literal[1, 2], Meta(description="1 uses velocity, 2 acceleration too (worse: paper)")
+    ] = 1
+    max_s: Annotated[
+        float, Meta(ge=0, le=5, description="never predict farther ahead than this, seconds")
+    ] = 0.5
+    camera_offset_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=2,
+            description="part of the camera's delay that its time stamp does not show, seconds",
+        ),
+    ] = 0.0
+
+
+class Config(_Section, frozen=True):
+    """The whole configuration."""
+
+    camera: CameraConfig = msgspec.field(default_factory=CameraConfig)
+    detection: DetectionConfig = msgspec.field(default_factory=DetectionConfig)
+    tracking: TrackingConfig = msgspec.field(default_factory=TrackingConfig)
+    decision: DecisionConfig = msgspec.field(default_factory=DecisionConfig)
+    feedback: FeedbackConfig = msgspec.field(default_factory=FeedbackConfig)
+    mqtt: MqttConfig = msgspec.field(default_factory=MqttConfig)
+    web: WebConfig = msgspec.field(default_factory=WebConfig)
+    audit: AuditConfig = msgspec.field(default_factory=AuditConfig)
+    latency: LatencyConfig = msgspec.field(default_factory=LatencyConfig)

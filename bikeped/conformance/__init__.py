@@ -1,0 +1,1 @@
+"""The conformance simulation: scripted hazards through the deployed tracker and rules."""

@@ -1,0 +1,301 @@
+"""Scenario files: who moves where and when, in the world frame (x east, y north, metres)."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import yaml
+
+from bikeped.errors import ScenarioError
+from bikeped.types import FloatArray
+
+#: Length along the heading, width, height in metres (definitions, section 3).
+SIZES_M: dict[str, tuple[float, float, float]] = {
+    "pedestrian": (0.3, 0.5, 1.7),
+    "cyclist": (1.8, 0.6, 1.7),
+    "car": (4.5, 1.8, 1.5),
+    "motorcycle": (2.2, 0.8, 1.4),
+    "bus": (12.0, 2.5, 3.0),
+    "truck": (7.0, 2.5, 2.8),
+}
+HAZARDS = (
+    "safe",
+    "standard",
+    "high-speed",
+    "accessibility",
+    "multi-agent",
+    "edge",
+    "non-linear",
+)
+#: A scenario runs on for this long after the last waypoint (definitions, section 4).
+TAIL_S = 0.5
+_MAX_BYTES = 1_000_000
+_MAX_DURATION_S = 3600.0
+_MAX_COORDINATE_M = 10_000.0
+
+
+@dataclass(frozen=True)
+class Agent:
+    """One road user: `path` [n, 3] holds t (s), x, y (m); times strictly increase."""
+
+    id: int
+    kind: str
+    path: FloatArray
+    size_m: tuple[float, float, float]
+
+    @property
+    def start_s(self) -> float:
+        return float(self.path[0, 0])
+
+    @property
+    def end_s(self) -> float:
+        return float(self.path[-1, 0])
+
+    def at(self, t: float) -> tuple[FloatArray, float] | None:
+        """Position [2] and heading (radians from east) at `t`; None outside the agent's life."""
+        xy, heading, present = self.sample(np.asarray([t]))
+        return (xy[0], float(heading[0])) if present[0] else None
+
+    def sample(self, t: FloatArray) -> tuple[FloatArray, FloatArray, Any]:
+        """Positions [n, 2], headings [n] and presence [n] at times [n].
+
+        The heading is the direction of the current path segment; where an agent stands still it
+        keeps the last direction in which it moved (or the first it will move in). Absent: NaN.
+        """
+        times = self.path[:, 0]
+        present = (t >= times[0] - 1e-9) & (t <= times[-1] + 1e-9)
+        segment = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        t0, t1 = times[segment], times[segment + 1]
+        part = np.clip((t - t0) / (t1 - t0), 0.0, 1.0)[:, None]
+        xy = self.path[segment, 1:] * (1 - part) + self.path[segment + 1, 1:] * part
+        heading = self._headings()[segment]
+        return (
+            np.where(present[:, None], xy, np.nan),
+            np.where(present, heading, np.nan),
+            present,
+        )
+
+    def _headings(self) -> FloatArray:
+        step = np.diff(self.path[:, 1:], axis=0)
+        moving = np.hypot(step[:, 0], step[:, 1]) > 1e-9
+        heading = np.arctan2(step[:, 1], step[:, 0])
+        if not moving.any():
+            return np.zeros(len(step))
+        source = np.maximum.accumulate(np.where(moving, np.arange(len(step)), -1))
+        source[source < 0] = int(np.argmax(moving))
+        out: FloatArray = heading[source]
+        return out
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One scripted encounter."""
+
+    name: str
+    hazard: str
+    expected: str
+    vehicle: str
+    agents: tuple[Agent, ...]
+    story: str = ""
+    source: str = ""
+
+    @property
+    def last_waypoint_s(self) -> float:
+        return max(agent.end_s for agent in self.agents)
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the last frame's bound: the last waypoint plus half a second."""
+        return self.last_waypoint_s + TAIL_S
+
+    def frame_times(self, fps: float = 30.0) -> FloatArray:
+        """Times i / fps that are at most `duration_s` (tolerating the last bit)."""
+        return np.arange(math.floor(self.duration_s * fps + 1e-6) + 1) / fps
+
+    def renamed(self, name: str) -> Scenario:
+        return replace(self, name=name)
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Reads one scenario file; raises ScenarioError naming the file, the agent and the mend."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ScenarioError(f"{path}: larger than 1 MB; a scenario is a short text")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: is not UTF-8 text; save it as UTF-8") from error
+    return parse_scenario(text, str(path))
+
+
+def load_scenarios(folder: Path) -> list[Scenario]:
+    """All `*.yaml` and `*.yml` of a folder in file-name order, names unique."""
+    if not folder.is_dir():
+        raise ScenarioError(f"{folder}: is not a folder of scenario files; check --scenarios")
+    files = sorted(p for p in folder.iterdir() if p.suffix in {".yaml", ".yml"})
+    if not files:
+        raise ScenarioError(f"{folder}: holds no scenario file (*.yaml); check --scenarios")
+    scenarios = [load_scenario(path) for path in files]
+    seen: dict[str, str] = {}
+    for scenario in scenarios:
+        if scenario.name in seen:
+            raise ScenarioError(
+                f"{scenario.source}: name {scenario.name!r} is taken by {seen[scenario.name]}; "
+                "give each scenario its own name"
+            )
+        seen[scenario.name] = scenario.source
+    return scenarios
+
+
+def bundled_folder() -> Path:
+    """Folder of the 24 scenarios that come with bikeped."""
+    return Path(__file__).parent / "scenarios"
+
+
+def parse_scenario(text: str, source: str) -> Scenario:
+    """A scenario from YAML text; `source` names it in errors."""
+    try:
+        data = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark is not None else ""
+        raise ScenarioError(f"{source}{where}: is not YAML; check the indentation") from error
+    top = _mapping(data, source, "scenario")
+    _known(top, {"name", "hazard", "expected", "vehicle", "agents", "story"}, source, "")
+    name = top.get("name")
+    if not isinstance(name, str) or not name.strip():
+        raise ScenarioError(f"{source}: name: expected a text; write name: My Scenario")
+    agents_data = top.get("agents")
+    if not isinstance(agents_data, list) or not agents_data:
+        raise ScenarioError(f"{source}: agents: expected a list of at least one agent")
+    agents = tuple(_agent(item, source, i) for i, item in enumerate(agents_data))
+    ids = [agent.id for agent in agents]
+    twice = next((i for i in ids if ids.count(i) > 1), None)
+    if twice is not None:
+        raise ScenarioError(f"{source}: agent {twice}: id is used twice; give each its own")
+    return Scenario(
+        name=name.strip(),
+        hazard=_choice(top.get("hazard", "standard"), HAZARDS, source, "hazard"),
+        expected=_choice(
+            top.get("expected", "warning"),
+            ("idle", "safe", "warning", "alert"),
+            source,
+            "expected",
+        ),
+        vehicle=_choice(top.get("vehicle", "bicycle"), ("bicycle", "ebike"), source, "vehicle"),
+        agents=agents,
+        story=" ".join(str(top.get("story", "")).split()),
+        source=source,
+    )
+
+
+def dump_scenario(scenario: Scenario) -> str:
+    """YAML text that `parse_scenario` reads back to the same scenario."""
+    lines = [
+        f"name: {_quoted(scenario.name)}",
+        f"hazard: {scenario.hazard}",
+        f"expected: {scenario.expected}",
+        f"vehicle: {scenario.vehicle}",
+    ]
+    if scenario.story:
+        lines.append(f"story: {_quoted(scenario.story)}")
+    lines.append("agents:")
+    for agent in scenario.agents:
+        path = ", ".join("[" + ", ".join(repr(float(v)) for v in p) + "]" for p in agent.path)
+        size = ""
+        if agent.size_m != SIZES_M[agent.kind]:
+            length, width, height = agent.size_m
+            size = f", size: {{length: {length!r}, width: {width!r}, height: {height!r}}}"
+        lines.append(f"  - {{id: {agent.id}, kind: {agent.kind}{size}, path: [{path}]}}")
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    return msgspec.json.encode(text).decode()  # a JSON string is a YAML string
+
+
+def _mapping(data: object, source: str, what: str) -> Mapping[str, Any]:
+    if not isinstance(data, dict) or not all(isinstance(key, str) for key in data):
+        raise ScenarioError(f"{source}: {what}: expected keys and values, see the documentation")
+    return data
+
+
+def _known(data: Mapping[str, Any], known: set[str], source: str, where: str) -> None:
+    for key in data:
+        if key not in known:
+            near = difflib.get_close_matches(key, sorted(known), 1)
+            mend = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}"
+            raise ScenarioError(f"{source}: {where}{key}: unknown key; {mend}")
+
+
+def _choice(value: object, allowed: tuple[str, ...], source: str, key: str) -> str:
+    text = value.lower() if isinstance(value, str) else value
+    if text not in allowed:
+        raise ScenarioError(f"{source}: {key}: {value!r} is not one of {', '.join(allowed)}")
+    return str(text)
+
+
+def _agent(item: object, source: str, index: int) -> Agent:
+    data = _mapping(item, source, f"agents[{index}]")
+    number = data.get("id")
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**31:
+        raise ScenarioError(f"{source}: agents[{index}]: id: expected a whole number from 0")
+    where = f"agent {number}: "
+    _known(data, {"id", "kind", "path", "size", "note"}, source, where)
+    kind = _choice(data.get("kind"), tuple(SIZES_M), source, f"{where}kind")
+    points = data.get("path")
+    if not isinstance(points, list) or len(points) < 2:
+        raise ScenarioError(f"{source}: {where}path: needs at least two waypoints [t, x, y]")
+    rows = []
+    for i, point in enumerate(points):
+        if not isinstance(point, list) or len(point) != 3:
+            raise ScenarioError(f"{source}: {where}path[{i}]: expected [t, x, y]")
+        rows.append([_number(v, source, f"{where}path[{i}]") for v in point])
+    path = np.asarray(rows, dtype=np.float64)
+    step = np.diff(path[:, 0])
+    if not (step > 0).all():
+        bad = int(np.argmax(step <= 0)) + 1
+        raise ScenarioError(
+            f"{source}: {where}path[{bad}]: time {path[bad, 0]:g} s is not after "
+            f"{path[bad - 1, 0]:g} s; sort the waypoints by time"
+        )
+    if path[0, 0] < 0 or path[-1, 0] > _MAX_DURATION_S:
+        raise ScenarioError(f"{source}: {where}path: times must lie in 0 to {_MAX_DURATION_S:g} s")
+    if np.abs(path[:, 1:]).max() > _MAX_COORDINATE_M:
+        raise ScenarioError(f"{source}: {where}path: a position is over 10 km away; use metres")
+    return Agent(number, kind, path, _size(data.get("size"), kind, source, where))
+
+
+def _size(value: object, kind: str, source: str, where: str) -> tuple[float, float, float]:
+    default = SIZES_M[kind]
+    if value is None:
+        return default
+    data = _mapping(value, source, f"{where}size")
+    _known(data, {"length", "width", "height"}, source, f"{where}size.")
+    parts = []
+    for key, usual in zip(("length", "width", "height"), default, strict=True):
+        number = _number(data.get(key, usual), source, f"{where}size.{key}")
+        if not 0.05 <= number <= 30:
+            raise ScenarioError(f"{source}: {where}size.{key}: {number:g} is not 0.05 to 30 m")
+        parts.append(number)
+    return parts[0], parts[1], parts[2]
+
+
+def _number(value: object, source: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ScenarioError(f"{source}: {where}: {value!r} is not a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ScenarioError(f"{source}: {where}: {value!r} is not a finite number")
+    return number

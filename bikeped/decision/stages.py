@@ -1,0 +1,33 @@
+"""The three stages (paper, algorithm 1): who is there, who was there, who is approaching."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.decision.rows import IndexArray
+from bikeped.types import BoolArray, FloatArray, State
+
+_EPSILON_S = 1e-6
+
+
+def resolve(
+    pedestrian_present: BoolArray, cyclist_remembered: BoolArray, approaching: BoolArray
+) -> npt.NDArray[np.int8]:
+    """State codes [n]: IDLE without a pedestrian, SAFE without a remembered cyclist, else ALERT or
+    WARNING by the closing check."""
+    state = np.where(approaching, State.ALERT, State.WARNING)
+    state = np.where(cyclist_remembered, state, State.SAFE)
+    return np.where(pedestrian_present, state, State.IDLE).astype(np.int8)
+
+
+def remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:
+    """Whether a cyclist was tracked within the memory; a memory of 0 s means now."""
+    return np.asarray(now_s - last_cyclist_s <= memory_s + _EPSILON_S)
+
+
+def frames_with(frame: IndexArray, frames: int) -> BoolArray:
+    """[frames]: which of them are named in `frame`."""
+    out = np.zeros(frames, np.bool_)
+    out[frame] = True
+    return out

@@ -1,0 +1,46 @@
+"""Errors that a user can act on.
+
+Every message names the file, the key and the mend in one line; the command line prints it on
+standard error and ends with status 2 (`BikepedError.exit_status`). Anything that is not a
+`BikepedError` is a bug in bikeped.
+"""
+
+from __future__ import annotations
+
+
+class BikepedError(Exception):
+    """Root of every error that bikeped raises on purpose."""
+
+    exit_status = 2
+
+
+class ConfigError(BikepedError):
+    """The configuration, or a file that it names, is wrong."""
+
+
+class CalibrationError(BikepedError):
+    """A camera calibration is missing, malformed, or does not fit the camera."""
+
+
+class GeometryError(BikepedError):
+    """A lens, a framing or a table was asked for something that it cannot answer."""
+
+
+class CaptureError(BikepedError):
+    """A camera, a video or a picture cannot be opened or read."""
+
+
+class DetectorError(BikepedError):
+    """A model file cannot be loaded, or its output has no layout known to bikeped."""
+
+
+class FeedbackError(BikepedError):
+    """The light or the speaker cannot be driven."""
+
+
+class TelemetryError(BikepedError):
+    """A broker, an event file or a message is unusable."""
+
+
+class ScenarioError(BikepedError):
+    """A scenario file is malformed."""

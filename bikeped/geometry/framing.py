@@ -1,0 +1,96 @@
+"""Sensor frame, padded square, crop, and scaled recordings of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.errors import GeometryError
+from bikeped.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Framing:
+    """How a frame of `frame_w` x `frame_h` lies in the crop that the calibration speaks of.
+
+    The sensor image (`sensor_w` x `sensor_h`) is centred in a black square of side `pad_size`,
+    whose middle square of side `crop_size` is the crop. None leaves a step out. A frame may be a
+    scaled copy of the sensor image (a smaller recording): `scale` is sensor over frame pixels.
+    """
+
+    sensor_w: int
+    sensor_h: int
+    pad_size: int | None = None
+    crop_size: int | None = None
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.pad_size is not None and self.pad_size < max(self.sensor_w, self.sensor_h):
+            raise GeometryError(
+                f"camera.pad_size: {self.pad_size} is smaller than the sensor "
+                f"({self.sensor_w} x {self.sensor_h}); use at least "
+                f"{max(self.sensor_w, self.sensor_h)}"
+            )
+        if self.crop_size is not None and self.crop_size > min(self._padded()):
+            raise GeometryError(
+                f"camera.crop_size: {self.crop_size} is larger than the frame it is cut from "
+                f"({self._padded()[0]} x {self._padded()[1]}); lower it or raise camera.pad_size"
+            )
+
+    def _padded(self) -> tuple[int, int]:
+        if self.pad_size is None:
+            return self.sensor_w, self.sensor_h
+        return self.pad_size, self.pad_size
+
+    @property
+    def crop_wh(self) -> tuple[int, int]:
+        """Width and height of the crop, in sensor pixels."""
+        return self._padded() if self.crop_size is None else (self.crop_size, self.crop_size)
+
+    @property
+    def offset_px(self) -> tuple[int, int]:
+        """Sensor pixel (0, 0) in the crop."""
+        (pw, ph), (cw, ch) = self._padded(), self.crop_wh
+        return (
+            (pw - self.sensor_w) // 2 - (pw - cw) // 2,
+            (ph - self.sensor_h) // 2 - (ph - ch) // 2,
+        )
+
+    @property
+    def window_px(self) -> tuple[float, float, float, float]:
+        """The part of the crop that exists on the sensor: u0, v0, u1, v1, end exclusive."""
+        (ox, oy), (cw, ch) = self.offset_px, self.crop_wh
+        return (
+            float(max(ox, 0)),
+            float(max(oy, 0)),
+            float(min(ox + self.sensor_w, cw)),
+            float(min(oy + self.sensor_h, ch)),
+        )
+
+    def for_frame(self, frame_w: int, frame_h: int) -> Framing:
+        """The framing of frames of this size, scaled copies of the sensor image.
+
+        Raises GeometryError when the proportions differ: such a frame is another camera's.
+        """
+        scale = self.sensor_w / frame_w
+        if abs(frame_h * scale - self.sensor_h) > scale + 1e-9:
+            raise GeometryError(
+                f"camera.width, camera.height: frames are {frame_w} x {frame_h}, the configuration "
+                f"says {self.sensor_w} x {self.sensor_h}, of other proportions; set them (and "
+                "pad_size, crop_size) to the camera that made the frames"
+            )
+        return Framing(self.sensor_w, self.sensor_h, self.pad_size, self.crop_size, scale)
+
+    def frame_to_crop(self, uv_px: npt.ArrayLike) -> FloatArray:
+        """Frame pixels [..., 2] in the crop."""
+        uv: FloatArray = np.asarray(uv_px, dtype=np.float64) * self.scale
+        return uv + np.asarray(self.offset_px, dtype=np.float64)
+
+    def crop_to_frame(self, uv_px: npt.ArrayLike) -> FloatArray:
+        """Crop pixels [..., 2] in the frame."""
+        uv: FloatArray = np.asarray(uv_px, dtype=np.float64) - np.asarray(
+            self.offset_px, dtype=np.float64
+        )
+        return uv / self.scale

@@ -1,0 +1,201 @@
+"""The tracker, over many independent scenes ("lanes") at once.
+
+The pole runs one lane; the simulation runs the same code over hundreds of Monte Carlo trials side
+by side. All lanes share the clock; a lane's tracks never see another lane's detections. State is
+held as arrays of shape [lanes, slots], where a slot holds one track until it is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bikeped.tracking.matching import IndexArray, match_greedy
+from bikeped.types import BoolArray, FloatArray, IntArray, KindArray
+
+#: Slack of comparisons between times, far below a frame and far above rounding.
+_EPSILON_S = 1e-6
+#: A track that is not yet confirmed is dropped when unseen for longer than this.
+_TENTATIVE_S = 0.2
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How detections become tracks; times in seconds, lengths in metres.
+
+    The defaults are the tracker of the paper's simulation (definitions, section 7); the pole's
+    come from the configuration. `max_speed_mps` by kind (pedestrian, cyclist, vehicle) gates a
+    match: a detection may lie at most speed * time since last seen + `position_noise_m` from the
+    track's last seen position. `velocity_weight` is the weight of the newest step per `frame_s`.
+    With `unbiased` the smoothed velocity starts at the first step instead of at zero.
+    """
+
+    match_radius_m: float = 3.0
+    max_unseen_s: float = 30 / 30
+    velocity_weight: float = 0.5
+    frame_s: float = 1 / 30
+    confirm_hits: int = 1
+    max_speed_mps: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    position_noise_m: float = math.inf
+    unbiased: bool = False
+
+
+class LaneTracker:
+    """Tracks of `lanes` independent scenes; `update` once a frame, then read the arrays.
+
+    Arrays are [lanes, slots] (positions, velocities, accelerations [lanes, slots, 2]); slots with
+    `alive` false hold rubbish. `id` counts up from 1 in each lane in order of birth; `detection`
+    is the index matched in the last update, or -1.
+    """
+
+    def __init__(self, settings: TrackerSettings, lanes: int = 1, slots: int = 8) -> None:
+        self.settings = settings
+        self.time_s = -math.inf
+        self.alive: BoolArray = np.zeros((lanes, slots), np.bool_)
+        self.id: IntArray = np.zeros((lanes, slots), np.int64)
+        self.kind: KindArray = np.zeros((lanes, slots), np.int8)
+        self.xy_m: FloatArray = np.zeros((lanes, slots, 2))
+        self.velocity_mps: FloatArray = np.zeros((lanes, slots, 2))
+        self.acceleration_mps2: FloatArray = np.zeros((lanes, slots, 2))
+        self.seen_s: FloatArray = np.zeros((lanes, slots))
+        self.hits: IntArray = np.zeros((lanes, slots), np.int64)
+        self.detection: IndexArray = np.full((lanes, slots), -1, np.intp)
+        self._seen_xy_m: FloatArray = np.zeros((lanes, slots, 2))
+        self._next_id: IntArray = np.ones(lanes, np.int64)
+        self._max_speed = np.asarray(settings.max_speed_mps)
+        self._gated = bool(np.isfinite(self._max_speed).any())
+
+    @property
+    def reported(self) -> BoolArray:
+        """[lanes, slots]: the tracks that count as present."""
+        return self.alive & (self.hits >= self.settings.confirm_hits)
+
+    def update(self, time_s: float, xy_m: FloatArray, kind: KindArray) -> None:
+        """Advances every lane to `time_s` with detections `xy_m` [lanes, n, 2].
+
+        `kind` [lanes, n]; -1 marks an empty place (lanes have different numbers of detections).
+        Time must not go back.
+        """
+        if time_s < self.time_s:
+            raise ValueError(f"time_s: {time_s} is before the last update at {self.time_s}")
+        step_s = time_s - self.time_s if math.isfinite(self.time_s) else 0.0
+        self.time_s = time_s
+        self.xy_m = np.where(
+            self.alive[..., None], self.xy_m + self.velocity_mps * step_s, self.xy_m
+        )
+        matched, refused = self._match(xy_m, kind)
+        self.detection = matched
+        self._correct(time_s, xy_m, matched)
+        self._drop(time_s)
+        fresh = kind >= 0
+        lane, slot = np.nonzero(matched >= 0)
+        fresh[lane, matched[lane, slot]] = False
+        if refused is not None:
+            fresh &= ~refused
+        if fresh.any():
+            self._add(time_s, xy_m, kind, fresh)
+
+    def _match(self, xy_m: FloatArray, kind: KindArray) -> tuple[IndexArray, BoolArray | None]:
+        """Detection of each slot, and the detections that only a gate kept from a free track."""
+        cost = np.hypot(
+            self.xy_m[:, :, None, 0] - xy_m[:, None, :, 0],
+            self.xy_m[:, :, None, 1] - xy_m[:, None, :, 1],
+        )
+        near = self.alive[:, :, None] & (self.kind[:, :, None] == kind[:, None, :])
+        near &= cost <= self.settings.match_radius_m
+        allowed = near
+        if self._gated:
+            reach = (
+                self._max_speed[self.kind] * (self.time_s - self.seen_s)
+                + self.settings.position_noise_m
+            )
+            way = np.hypot(
+                self._seen_xy_m[:, :, None, 0] - xy_m[:, None, :, 0],
+                self._seen_xy_m[:, :, None, 1] - xy_m[:, None, :, 1],
+            )
+            allowed = near & (way <= reach[:, :, None])
+        matched = match_greedy(np.where(allowed, cost, np.inf))
+        if not self._gated:
+            return matched, None
+        # A gate may refuse a match but must not breed tracks: a detection beside a track that is
+        # still free is that track's, too far for one frame; it waits until the gate has widened.
+        refused = (near & (matched < 0)[:, :, None]).any(axis=1)
+        return matched, refused
+
+    def _correct(self, time_s: float, xy_m: FloatArray, matched: IndexArray) -> None:
+        lane, slot = np.nonzero(matched >= 0)
+        if len(lane) == 0:
+            return
+        at = (lane, slot)
+        new_xy = xy_m[lane, matched[at]]
+        elapsed = np.maximum(time_s - self.seen_s[at], _EPSILON_S)
+        keep = (1 - self.settings.velocity_weight) ** (elapsed / self.settings.frame_s)
+        old_v, old_a = self.velocity_mps[at], self.acceleration_mps2[at]
+        raw_v = (new_xy - self._seen_xy_m[at]) / elapsed[:, None]
+        if self.settings.unbiased:
+            keep = np.where(self.hits[at] == 1, 0.0, keep)
+        new_v = old_v * keep[:, None] + raw_v * (1 - keep)[:, None]
+        if self._gated:
+            speed = np.hypot(new_v[:, 0], new_v[:, 1])
+            new_v *= np.minimum(1.0, self._max_speed[self.kind[at]] / np.maximum(speed, 1e-9))[
+                :, None
+            ]
+        raw_a = (new_v - old_v) / elapsed[:, None]
+        self.velocity_mps[at] = new_v
+        self.acceleration_mps2[at] = old_a * keep[:, None] + raw_a * (1 - keep)[:, None]
+        self.xy_m[at] = new_xy
+        self._seen_xy_m[at] = new_xy
+        self.seen_s[at] = time_s
+        self.hits[at] += 1
+
+    def _drop(self, time_s: float) -> None:
+        unseen = time_s - self.seen_s
+        limit = np.where(
+            self.hits >= self.settings.confirm_hits,
+            self.settings.max_unseen_s,
+            min(_TENTATIVE_S, self.settings.max_unseen_s),
+        )
+        self.alive &= unseen <= limit + _EPSILON_S
+
+    def _add(self, time_s: float, xy_m: FloatArray, kind: KindArray, fresh: BoolArray) -> None:
+        need = fresh.sum(axis=1)
+        while (need > (~self.alive).sum(axis=1)).any():
+            self._grow()
+        free = np.argsort(self.alive, axis=1, kind="stable")  # free slots first, in slot order
+        order = fresh.cumsum(axis=1) - 1
+        lane, detection = np.nonzero(fresh)
+        rank = order[lane, detection]
+        at = (lane, free[lane, rank])
+        self.alive[at] = True
+        self.id[at] = self._next_id[lane] + rank
+        self._next_id += need
+        self.kind[at] = kind[lane, detection]
+        self.xy_m[at] = xy_m[lane, detection]
+        self._seen_xy_m[at] = xy_m[lane, detection]
+        self.velocity_mps[at] = 0.0
+        self.acceleration_mps2[at] = 0.0
+        self.seen_s[at] = time_s
+        self.hits[at] = 1
+        self.detection[at] = detection
+
+    def _grow(self) -> None:
+        """Doubles the slots."""
+        lanes, slots = self.alive.shape
+
+        def wider(array: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+            return np.concatenate([array, np.zeros_like(array)], axis=1)
+
+        self.alive = wider(self.alive)
+        self.id = wider(self.id)
+        self.kind = wider(self.kind)
+        self.xy_m = wider(self.xy_m)
+        self.velocity_mps = wider(self.velocity_mps)
+        self.acceleration_mps2 = wider(self.acceleration_mps2)
+        self.seen_s = wider(self.seen_s)
+        self.hits = wider(self.hits)
+        self._seen_xy_m = wider(self._seen_xy_m)
+        self.detection = np.concatenate(
+            [self.detection, np.full((lanes, slots), -1, np.intp)], axis=1
+        )

@@ -1,0 +1,210 @@
+"""One small frozen type a stage: frame, detections, ground points, tracks, decision.
+
+Times are seconds on the machine's monotonic clock (`*_s`), pixels are sensor pixels unless a name
+says otherwise, positions are metres in the camera ground frame (x forward, y right, origin on the
+ground below the lens). Arrays run in parallel; `check` functions state expected and actual shape.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+KindArray = npt.NDArray[np.int8]
+BoolArray = npt.NDArray[np.bool_]
+ImageArray = npt.NDArray[np.uint8]
+
+
+class Kind(enum.IntEnum):
+    """What an object is to the decision; the code is what kind arrays hold."""
+
+    PEDESTRIAN = 0
+    CYCLIST = 1
+    VEHICLE = 2
+
+    @property
+    def label(self) -> str:
+        """The word used in files and messages: `pedestrian`, `cyclist`, `vehicle`."""
+        return self.name.lower()
+
+
+class State(enum.IntEnum):
+    """The decision's four output states (paper, table 2), in order of urgency."""
+
+    IDLE = 0
+    SAFE = 1
+    WARNING = 2
+    ALERT = 3
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture as the camera gave it, undecoded where the camera encodes.
+
+    Exactly one of `jpeg` (a whole JPEG file) and `rgb` (height x width x 3, uint8) is set.
+    """
+
+    number: int  #: counts every frame that the source delivered, dropped ones included
+    captured_s: float  #: capture time; monotonic for a live camera, media time for a recording
+    width: int  #: of the full picture, in pixels
+    height: int
+    jpeg: bytes | memoryview | None = None
+    rgb: ImageArray | None = None
+
+    def __post_init__(self) -> None:
+        if (self.jpeg is None) == (self.rgb is None):
+            raise ValueError("a Frame holds either jpeg or rgb, not both and not neither")
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What the detector found in one frame, most confident first.
+
+    `kind` [n] int8 codes of `Kind`; `confidence` [n] in 0..1; `box_px` [n, 4] as u1, v1, u2, v2
+    in pixels of the full frame.
+    """
+
+    kind: KindArray
+    confidence: Float32Array
+    box_px: Float32Array
+
+    def __post_init__(self) -> None:
+        n = len(self.kind)
+        _expect("Detections.kind", self.kind, (n,))
+        _expect("Detections.confidence", self.confidence, (n,))
+        _expect("Detections.box_px", self.box_px, (n, 4))
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    @staticmethod
+    def empty() -> Detections:
+        return Detections(
+            np.zeros(0, np.int8), np.zeros(0, np.float32), np.zeros((0, 4), np.float32)
+        )
+
+    def take(self, index: npt.NDArray[Any]) -> Detections:
+        """The detections at `index` (integers or a mask), in that order."""
+        return Detections(self.kind[index], self.confidence[index], self.box_px[index])
+
+    def bottom_centre_px(self) -> FloatArray:
+        """[n, 2] u, v of the middle of each lower edge: the point that is put on the ground."""
+        box = self.box_px.astype(np.float64)
+        return np.stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]], axis=1)
+
+
+@dataclass(frozen=True)
+class GroundPoints:
+    """Detections on the ground: `kind` [n], `xy_m` [n, 2], `detection` [n] their index."""
+
+    kind: KindArray
+    xy_m: FloatArray
+    detection: IntArray
+
+    def __post_init__(self) -> None:
+        n = len(self.kind)
+        _expect("GroundPoints.xy_m", self.xy_m, (n, 2))
+        _expect("GroundPoints.detection", self.detection, (n,))
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """The objects believed present at `time_s`, oldest first (ascending id).
+
+    `id` [n]; `kind` [n]; `xy_m` [n, 2]; `velocity_mps` [n, 2]; `unseen_s` [n], 0 when matched in
+    this frame; `detection` [n], index of the matched detection in this frame or -1.
+    """
+
+    time_s: float
+    id: IntArray
+    kind: KindArray
+    xy_m: FloatArray
+    velocity_mps: FloatArray
+    unseen_s: FloatArray
+    detection: IntArray
+
+    def __post_init__(self) -> None:
+        n = len(self.id)
+        _expect("Tracks.kind", self.kind, (n,))
+        _expect("Tracks.xy_m", self.xy_m, (n, 2))
+        _expect("Tracks.velocity_mps", self.velocity_mps, (n, 2))
+        _expect("Tracks.unseen_s", self.unseen_s, (n,))
+        _expect("Tracks.detection", self.detection, (n,))
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @staticmethod
+    def empty(time_s: float) -> Tracks:
+        none = np.zeros(0, np.int64)
+        flat = np.zeros((0, 2))
+        return Tracks(time_s, none, np.zeros(0, np.int8), flat, flat, np.zeros(0), none)
+
+
+@dataclass(frozen=True)
+class PairNumbers:
+    """The figures that one cyclist-pedestrian pair was judged by."""
+
+    cyclist_id: int
+    pedestrian_id: int
+    distance_m: float
+    distance_then_m: float  #: at the start of the lookback
+    lookback_s: float
+    displacement_m: float  #: of the cyclist over the lookback
+    speed_mps: float  #: of the cyclist
+    d_min_m: float
+    d_max_m: float  #: raised to the stopping distance where the configuration says so
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the light must say at `time_s`, why, and in one line for a resident."""
+
+    time_s: float
+    state: State
+    sentence: str
+    pair: PairNumbers | None = None  #: the pair that fired (ALERT) or the nearest one (WARNING)
+
+
+class Colour(str, enum.Enum):
+    """Colours of the light."""
+
+    OFF = "off"
+    BLUE = "blue"
+    GREEN = "green"
+    ORANGE = "orange"
+    RED = "red"
+
+
+class Sound(str, enum.Enum):
+    """Sounds of the speaker."""
+
+    NONE = "none"
+    CHIME = "chime"
+    BELL = "bell"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """What the road user sees and hears."""
+
+    name: str  #: IDLE, SAFE, WARNING, ALERT, FAULT or OFF
+    colour: Colour
+    blink_hz: float = 0.0  #: 0 is steady
+    sound: Sound = Sound.NONE
+    faults: tuple[str, ...] = field(default=())  #: why the signal is FAULT, one line each
+
+
+def _expect(name: str, array: npt.NDArray[Any], shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
