@@ -8,14 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.decision.rows import IndexArray, TrackRows, pair_rows
+from bikeped.decision.rows import CYCLIST, PEDESTRIAN, IndexArray, TrackRows, pair_rows
 from bikeped.decision.rules import PairVerdicts, RuleSettings, judge
 from bikeped.decision.stages import remembered, resolve
 from bikeped.types import (
     Decision,
     FloatArray,
     IntArray,
-    Kind,
     KindArray,
     PairNumbers,
     State,
@@ -49,9 +48,9 @@ class Decider:
         rows = self._rows()
         frames = len(self._frames)
         verdicts, pair_ids = _judge_newest(rows, frames, self.settings)
-        if (kind == Kind.CYCLIST).any():
+        if (kind == CYCLIST).any():
             self._last_cyclist_s = time_s
-        pedestrians = int((kind == Kind.PEDESTRIAN).sum())
+        pedestrians = int((kind == PEDESTRIAN).sum())
         state = State(
             int(
                 resolve(
@@ -181,14 +180,12 @@ def _why_not(pair: PairNumbers, settings: RuleSettings) -> str:
     if pair.distance_m > pair.d_max_m:
         return f"farther than {pair.d_max_m:.1f} m"
     if pair.lookback_s <= 0:
-        return "seen together for the first time"
+        return f"just appeared, or more than {settings.max_range_m:g} m from the camera"
     if settings.rule == "ttc":
         return f"were {pair.distance_then_m:.2f} m {pair.lookback_s:.2f} s ago: not soon together"
     if pair.distance_m >= pair.distance_then_m - 1e-9:
         return f"were {pair.distance_then_m:.2f} m {pair.lookback_s:.2f} s ago: not closing"
-    if pair.displacement_m <= settings.min_displacement_m:
-        return (
-            f"closing, but the cyclist moved only {pair.displacement_m:.2f} m in "
-            f"{pair.lookback_s:.2f} s"
-        )
-    return f"not judged beyond {settings.max_range_m:g} m from the camera"
+    return (
+        f"closing, but the cyclist moved only {pair.displacement_m:.2f} m in "
+        f"{pair.lookback_s:.2f} s"
+    )

@@ -16,6 +16,9 @@ from bikeped.types import FloatArray, IntArray, Kind, KindArray
 
 IndexArray = npt.NDArray[np.intp]
 
+# Plain integers: numpy looks an enum's attributes up at every comparison.
+CYCLIST, PEDESTRIAN = int(Kind.CYCLIST), int(Kind.PEDESTRIAN)
+
 
 @dataclass(frozen=True)
 class TrackRows:
@@ -54,8 +57,8 @@ class Pairs:
 def pair_rows(rows: TrackRows, frames: int, first_frame: int = 0) -> Pairs:
     """All cyclist-pedestrian pairs of each of the frames first_frame..frames-1."""
     asked = rows.frame >= first_frame
-    cyclist_row = np.nonzero(asked & (rows.kind == Kind.CYCLIST))[0]
-    pedestrian_row = np.nonzero(asked & (rows.kind == Kind.PEDESTRIAN))[0]
+    cyclist_row = np.nonzero(asked & (rows.kind == CYCLIST))[0]
+    pedestrian_row = np.nonzero(asked & (rows.kind == PEDESTRIAN))[0]
     count = np.bincount(rows.frame[pedestrian_row], minlength=frames)
     start = np.cumsum(count) - count
     frame = rows.frame[cyclist_row]

@@ -51,8 +51,8 @@ class RuleSettings:
 class PairVerdicts:
     """What the rule says of each pair [m], and the numbers that made it say so.
 
-    `judged` is false for pairs out of range, out of bounds or without an earlier position; their
-    other numbers are still those of the pair (a lookback of 0 s where there is none).
+    `judged` is false for pairs out of range, out of bounds or without an earlier position; they
+    have a lookback of 0 s and no displacement.
     """
 
     fires: BoolArray
@@ -83,40 +83,70 @@ def judge(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairVerdicts
         d_max = np.maximum(
             d_max, stopping_distance(speed, settings.reaction_s, settings.deceleration_mps2)
         )
-    c_then, p_then, elapsed = _look_back(rows, cyclist, pedestrian, settings.lookback_s)
-    then = _length(c_then - p_then)
-    displacement = _length(c_now - c_then)
-    judged = (
-        (_length(c_now) <= settings.max_range_m)
-        & (_length(p_now) <= settings.max_range_m)
-        & (distance >= settings.d_min_m)
+    near = (
+        (distance >= settings.d_min_m)
         & (distance <= d_max)
-        & (elapsed > 0)
+        & (_length(c_now) <= settings.max_range_m)
+        & (_length(p_now) <= settings.max_range_m)
     )
-    if settings.rule == "pairwise":
-        fires = (distance < then - EPSILON_M) & (displacement > settings.min_displacement_m)
-    elif settings.rule == "naive":
-        then = _length(c_then - p_now)  # the pedestrian's old position is left out: its flaw
-        fires = (distance < then - EPSILON_M) & (displacement > settings.min_displacement_m)
-    elif settings.rule == "ttc":
-        closing = (then - distance) / np.maximum(elapsed, EPSILON_S)
-        fires = (closing > TTC_CLOSING_MIN_MPS) & (distance < settings.ttc_s * closing)
-    else:
-        fires = np.ones(len(pairs), np.bool_)
+    # Only these are looked up in the past: of thousands of pairs in a crowd few are within bounds.
+    index = np.nonzero(near)[0]
+    c_then, p_then, elapsed = _look_back(
+        rows, cyclist[index], pedestrian[index], settings.lookback_s
+    )
+    fires, then, displacement = _close_in(
+        settings, distance[index], c_now[index], p_now[index], c_then, p_then, elapsed
+    )
+
+    def spread(part: FloatArray, rest: FloatArray) -> FloatArray:
+        whole = rest.copy()
+        whole[index] = part
+        return whole
+
+    nothing = np.zeros(len(pairs))
+    judged = np.zeros(len(pairs), np.bool_)
+    judged[index] = elapsed > 0
+    fired = np.zeros(len(pairs), np.bool_)
+    fired[index] = fires & (elapsed > 0)
     return PairVerdicts(
-        fires=fires & judged,
+        fires=fired,
         judged=judged,
         distance_m=distance,
-        distance_then_m=then,
-        lookback_s=elapsed,
-        displacement_m=displacement,
+        distance_then_m=spread(then, distance),
+        lookback_s=spread(elapsed, nothing),
+        displacement_m=spread(displacement, nothing),
         speed_mps=speed,
         d_max_m=d_max,
     )
 
 
+def _close_in(
+    settings: RuleSettings,
+    distance: FloatArray,
+    c_now: FloatArray,
+    p_now: FloatArray,
+    c_then: FloatArray,
+    p_then: FloatArray,
+    elapsed: FloatArray,
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """The rule itself: which pairs fire, the old distance it compared with, the cyclist's way."""
+    then = _length(c_then - p_then)
+    displacement = _length(c_now - c_then)
+    if settings.rule == "distance":
+        return np.ones(len(distance), np.bool_), then, displacement
+    if settings.rule == "ttc":
+        closing = (then - distance) / np.maximum(elapsed, EPSILON_S)
+        soon = distance < settings.ttc_s * closing
+        return (closing > TTC_CLOSING_MIN_MPS) & soon, then, displacement
+    if settings.rule == "naive":
+        then = _length(c_then - p_now)  # the pedestrian's old position is left out: its flaw
+    closer = distance < then - EPSILON_M
+    return closer & (displacement > settings.min_displacement_m), then, displacement
+
+
 def _length(vector: FloatArray) -> FloatArray:
-    return np.hypot(vector[:, 0], vector[:, 1])
+    x, y = vector[:, 0], vector[:, 1]
+    return np.sqrt(x * x + y * y)
 
 
 def _look_back(

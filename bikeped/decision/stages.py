@@ -9,6 +9,7 @@ from bikeped.decision.rows import IndexArray
 from bikeped.types import BoolArray, FloatArray, State
 
 _EPSILON_S = 1e-6
+_IDLE, _SAFE, _WARNING, _ALERT = (int(s) for s in State)
 
 
 def resolve(
@@ -16,9 +17,9 @@ def resolve(
 ) -> npt.NDArray[np.int8]:
     """State codes [n]: IDLE without a pedestrian, SAFE without a remembered cyclist, else ALERT or
     WARNING by the closing check."""
-    state = np.where(approaching, State.ALERT, State.WARNING)
-    state = np.where(cyclist_remembered, state, State.SAFE)
-    return np.where(pedestrian_present, state, State.IDLE).astype(np.int8)
+    state = np.where(approaching, _ALERT, _WARNING)
+    state = np.where(cyclist_remembered, state, _SAFE)
+    return np.where(pedestrian_present, state, _IDLE).astype(np.int8)
 
 
 def remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:

@@ -99,30 +99,43 @@ class LaneTracker:
 
     def _match(self, xy_m: FloatArray, kind: KindArray) -> tuple[IndexArray, BoolArray | None]:
         """Detection of each slot, and the detections that only a gate kept from a free track."""
-        cost = np.hypot(
-            self.xy_m[:, :, None, 0] - xy_m[:, None, :, 0],
-            self.xy_m[:, :, None, 1] - xy_m[:, None, :, 1],
-        )
-        near = self.alive[:, :, None] & (self.kind[:, :, None] == kind[:, None, :])
-        near &= cost <= self.settings.match_radius_m
-        allowed = near
-        if self._gated:
-            reach = (
-                self._max_speed[self.kind] * (self.time_s - self.seen_s)
-                + self.settings.position_noise_m
-            )
-            way = np.hypot(
-                self._seen_xy_m[:, :, None, 0] - xy_m[:, None, :, 0],
-                self._seen_xy_m[:, :, None, 1] - xy_m[:, None, :, 1],
-            )
-            allowed = near & (way <= reach[:, :, None])
-        matched = match_greedy(np.where(allowed, cost, np.inf))
+        lanes, slots = self.alive.shape
+        detections = kind.shape[1]
+        track_xy = np.where(self.alive[..., None], self.xy_m, np.nan)  # NaN is near nothing
+        dx = track_xy[:, :, None, 0] - xy_m[:, None, :, 0]
+        dy = track_xy[:, :, None, 1] - xy_m[:, None, :, 1]
+        cost = dx * dx + dy * dy
+        lane, slot, detection = np.nonzero(cost <= self.settings.match_radius_m**2)
+        same = self.kind[lane, slot] == kind[lane, detection]
+        lane, slot, detection = lane[same], slot[same], detection[same]
+        track = lane * slots + slot
+        place = lane * detections + detection
+        near_cost = cost[lane, slot, detection]
         if not self._gated:
-            return matched, None
+            matched = match_greedy(track, place, near_cost, lanes * slots, lanes * detections)
+            return self._per_slot(matched, detections), None
+        reach = (
+            self._max_speed[self.kind[lane, slot]] * (self.time_s - self.seen_s[lane, slot])
+            + self.settings.position_noise_m
+        )
+        way = xy_m[lane, detection] - self._seen_xy_m[lane, slot]
+        allowed = way[:, 0] ** 2 + way[:, 1] ** 2 <= reach**2
+        matched = match_greedy(
+            track[allowed], place[allowed], near_cost[allowed], lanes * slots, lanes * detections
+        )
         # A gate may refuse a match but must not breed tracks: a detection beside a track that is
         # still free is that track's, too far for one frame; it waits until the gate has widened.
-        refused = (near & (matched < 0)[:, :, None]).any(axis=1)
-        return matched, refused
+        refused = np.zeros((lanes, detections), np.bool_)
+        waiting = ~allowed & (matched[track] < 0)
+        refused[lane[waiting], detection[waiting]] = True
+        return self._per_slot(matched, detections), refused
+
+    def _per_slot(self, matched: IndexArray, detections: int) -> IndexArray:
+        """[lanes, slots] index within the lane, from the flat index over all lanes."""
+        shaped = matched.reshape(self.alive.shape)
+        if len(shaped) == 1:
+            return shaped
+        return np.where(shaped >= 0, shaped - np.arange(len(shaped))[:, None] * detections, -1)
 
     def _correct(self, time_s: float, xy_m: FloatArray, matched: IndexArray) -> None:
         lane, slot = np.nonzero(matched >= 0)

@@ -2,9 +2,9 @@
 
 Greedy and not optimal (Hungarian): a resident can follow "nearest first" with a finger on the
 plan, and the paper's tracker does it. The exact order is: all allowed pairs sorted by distance
-(ties: lower track slot, then lower detection), each taken if both are still free. A pair that is
-the nearest of its track *and* of its detection is taken by that order whatever the others do, so
-all such pairs are taken at once, and the rest is looked at again: a few rounds instead of a sort.
+(ties: lower track, then lower detection), each taken if both are still free. A pair that is the
+nearest of its track *and* of its detection is taken by that order whatever the others do, so all
+such pairs are taken at once, and the rest is looked at again: a few rounds instead of a loop.
 """
 
 from __future__ import annotations
@@ -17,27 +17,32 @@ from bikeped.types import FloatArray
 IndexArray = npt.NDArray[np.intp]
 
 
-def match_greedy(cost: FloatArray) -> IndexArray:
-    """Detection of each track [lanes, tracks], -1 for none, of `cost` [lanes, tracks, detections].
+def match_greedy(
+    track: IndexArray, detection: IndexArray, cost: FloatArray, tracks: int, detections: int
+) -> IndexArray:
+    """Detection of each track [tracks], -1 for none, from candidate pairs.
 
-    Forbidden pairs cost infinity. `cost` is used up: it is overwritten.
+    `track`, `detection`, `cost` [m] are the allowed pairs in ascending (track, detection) order,
+    with indices below `tracks` and `detections`.
     """
-    lanes, tracks, detections = cost.shape
-    matched = np.full((lanes, tracks), -1, np.intp)
-    if tracks == 0 or detections == 0:
+    matched = np.full(tracks, -1, np.intp)
+    if len(cost) == 0:
         return matched
-    lane_index = np.arange(lanes)[:, None]
-    track_index = np.arange(tracks)[None, :]
-    while True:
-        # argmin gives the first of equal values along each axis, which is the tie rule above.
-        best_detection = cost.argmin(axis=2)
-        best_cost = np.take_along_axis(cost, best_detection[..., None], 2)[..., 0]
-        best_track = cost.argmin(axis=1)
-        mutual = (best_track[lane_index, best_detection] == track_index) & (best_cost < np.inf)
-        lane, track = np.nonzero(mutual)
-        if len(lane) == 0:
-            return matched
-        detection = best_detection[lane, track]
-        matched[lane, track] = detection
-        cost[lane, track, :] = np.inf
-        cost[lane, :, detection] = np.inf
+    order = np.argsort(cost, kind="stable")
+    track, detection = track[order], detection[order]
+    first_of_track = np.empty(tracks, np.intp)
+    first_of_detection = np.empty(detections, np.intp)
+    while len(track):
+        rank = np.arange(len(track))
+        # Written backwards, the first (nearest) pair of each is what stays.
+        first_of_track[track[::-1]] = rank[::-1]
+        first_of_detection[detection[::-1]] = rank[::-1]
+        mutual = (first_of_track[track] == rank) & (first_of_detection[detection] == rank)
+        matched[track[mutual]] = detection[mutual]
+        if mutual.all():
+            break
+        taken = np.zeros(detections, np.bool_)
+        taken[detection[mutual]] = True
+        rest = (matched[track] < 0) & ~taken[detection]
+        track, detection = track[rest], detection[rest]
+    return matched
