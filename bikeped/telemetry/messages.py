@@ -1,0 +1,463 @@
+"""Every MQTT payload and every event line: their shape, and how they are built. Pure.
+
+Key names are those that programs outside rely on. Positions are metres in the camera ground frame
+(x forward, y right), rounded to a millimetre, so that files read well and two replays of one
+recording agree byte for byte. Only `latency_ms` and `started_at` differ between two runs; they come
+last in their line, and `decision_view` leaves them out.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from bikeped.errors import TelemetryError
+from bikeped.types import Decision, Detections, FloatArray, Kind, State, Tracks
+
+ShownState = Literal["IDLE", "SAFE", "WARNING", "ALERT", "FAULT", "OFF"]
+KindLabel = Literal["pedestrian", "cyclist", "vehicle"]
+Availability = Annotated[
+    Literal["online", "offline"],
+    Meta(description="plain text, not JSON: online while connected, offline at the end or as will"),
+]
+Timestamp = Annotated[
+    str,
+    Meta(
+        pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z$",
+        description="RFC 3339, UTC, to the millisecond",
+        extra_json_schema={"format": "date-time"},
+    ),
+]
+Point = Annotated[tuple[float, float], Meta(description="x forward, y right, metres")]
+Pair = Annotated[tuple[int, int], Meta(description="track ids: cyclist, pedestrian")]
+Count = Annotated[int, Meta(ge=0)]
+
+VOLATILE_KEYS = ("latency_ms", "started_at")  #: the only keys that differ between two replays
+
+_LABELS: dict[int, KindLabel] = {
+    Kind.PEDESTRIAN: "pedestrian",
+    Kind.CYCLIST: "cyclist",
+    Kind.VEHICLE: "vehicle",
+}
+_STATES: dict[State, ShownState] = {
+    State.IDLE: "IDLE",
+    State.SAFE: "SAFE",
+    State.WARNING: "WARNING",
+    State.ALERT: "ALERT",
+}
+
+# No field of a message has a default, so every key is always there.
+
+
+class Position(msgspec.Struct, frozen=True, kw_only=True):
+    """Where an object is."""
+
+    x: Annotated[float, Meta(description="forward of the camera, metres")]
+    y: Annotated[float, Meta(description="right of the camera, metres")]
+    distance: Annotated[float, Meta(ge=0, description="from the point below the lens, metres")]
+
+
+class Velocity(msgspec.Struct, frozen=True, kw_only=True):
+    """How an object moves."""
+
+    x: Annotated[float, Meta(description="metres per second")]
+    y: Annotated[float, Meta(description="metres per second")]
+    speed: Annotated[float, Meta(ge=0, description="metres per second")]
+
+
+class TrackedObject(msgspec.Struct, frozen=True, kw_only=True):
+    """One object of the tracks message."""
+
+    track_id: int
+    class_: KindLabel = msgspec.field(name="class")
+    position: Position
+    velocity: Velocity
+    history: Annotated[list[Point], Meta(description="recent positions, oldest first")]
+
+
+class TracksMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """`bikeped/<site>/tracks`, at the publish interval, not retained."""
+
+    timestamp: Timestamp
+    frame_number: Count
+    state: ShownState
+    objects: list[TrackedObject]
+
+
+class StateMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """`bikeped/<site>/state`, at every change, retained: what the light shows."""
+
+    state: ShownState
+    since: Timestamp
+    pair: Pair | None
+    distance_m: Annotated[float, Meta(ge=0)] | None
+    config_hash: str
+    sentence: Annotated[str, Meta(description="why, in one line for a resident")]
+
+
+class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
+    """Percentiles of one stage over the last frames, milliseconds."""
+
+    p50: float
+    p95: float
+    p99: float
+    max: float
+
+
+class Part(msgspec.Struct, frozen=True, kw_only=True):
+    """One part of the system: does it work, and one line about it."""
+
+    ok: bool
+    detail: str
+
+
+class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """The camera."""
+
+    ok: bool
+    detail: str
+    capture_age_ms: Annotated[
+        float | None, Meta(description="age of the newest frame; null before the first")
+    ]
+
+
+class Counters(msgspec.Struct, frozen=True, kw_only=True):
+    """Totals since the process started."""
+
+    frames: Count
+    dropped: Annotated[Count, Meta(description="frames replaced by a newer one before inference")]
+    undecodable: Annotated[Count, Meta(description="frames whose picture could not be decoded")]
+    alerts: Annotated[Count, Meta(description="changes into ALERT")]
+    mqtt_dropped: Annotated[Count, Meta(description="messages dropped before reaching the broker")]
+    audit_dropped: Annotated[Count, Meta(description="event lines not written to the audit log")]
+
+
+class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """`bikeped/<site>/health`, every 10 s by default, retained."""
+
+    timestamp: Timestamp
+    state: ShownState
+    version: str
+    config_hash: str
+    uptime_s: Annotated[float, Meta(ge=0)]
+    fps: Annotated[float, Meta(ge=0)]
+    latency_ms: Annotated[dict[str, StageLatency], Meta(description="by stage")]
+    camera: CameraHealth
+    detector: Part
+    light: Part
+    faults: Annotated[list[str], Meta(description="what is wrong, one line each; empty: nothing")]
+    counters: Counters
+
+
+class EventHeader(msgspec.Struct, frozen=True, kw_only=True):
+    """First line of an event file; in an audit log also the first line of every later run."""
+
+    format: Literal["bikeped-events/1"]
+    config_hash: str
+    calibration_hash: str | None
+    model_hash: str | None
+    version: str
+    started_at: Timestamp
+
+
+class EventTrack(msgspec.Struct, frozen=True, kw_only=True):
+    """One track of an event line."""
+
+    id: int
+    kind: KindLabel
+    x: Annotated[float, Meta(description="metres")]
+    y: Annotated[float, Meta(description="metres")]
+    vx: Annotated[float, Meta(description="metres per second")]
+    vy: Annotated[float, Meta(description="metres per second")]
+    lost: Annotated[bool, Meta(description="not seen in this frame: the position is predicted")]
+
+
+class EventDetection(msgspec.Struct, frozen=True, kw_only=True):
+    """One detection of an event line."""
+
+    kind: KindLabel
+    confidence: Annotated[float, Meta(ge=0, le=1)]
+    box: Annotated[
+        tuple[float, float, float, float], Meta(description="u1, v1, u2, v2 in sensor pixels")
+    ]
+
+
+class EventLine(msgspec.Struct, frozen=True, kw_only=True):
+    """One frame of an event file or of the audit log."""
+
+    t: Annotated[float, Meta(description="seconds from the start")]
+    frame: Count
+    state: ShownState
+    pair: Pair | None
+    tracks: list[EventTrack]
+    detections: list[EventDetection]
+    sentence: str
+    latency_ms: Annotated[dict[str, float], Meta(description="by stage")]
+
+
+_encoder = msgspec.json.Encoder()
+_decoder = msgspec.json.Decoder()
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    """The JSON payload of a message."""
+    return _encoder.encode(message)
+
+
+def encode_line(message: EventHeader | EventLine) -> bytes:
+    """The JSON line of an event, newline included."""
+    return _encoder.encode(message) + b"\n"
+
+
+def rfc3339(unix_s: float) -> str:
+    """Seconds since 1970 (UTC) as RFC 3339 to the nearest millisecond."""
+    whole_s, ms = divmod(round(unix_s * 1000), 1000)
+    stamp = dt.datetime.fromtimestamp(whole_s, tz=dt.timezone.utc).replace(tzinfo=None)
+    return f"{stamp.isoformat()}.{ms:03d}Z"
+
+
+def tracks_message(
+    *,
+    unix_s: float,
+    frame_number: int,
+    state: ShownState,
+    tracks: Tracks,
+    history: Mapping[int, Sequence[Sequence[float]] | FloatArray],
+) -> TracksMessage:
+    """The tracks message of one frame captured at `unix_s` (seconds since 1970).
+
+    `history` maps a track id to its recent [x, y] in metres, oldest first; a track that it does not
+    name gets none. A track without finite numbers is left out: it has no place on a map, and JSON
+    has no word for it.
+    """
+    keep = _finite(tracks)
+    xy, velocity = tracks.xy_m[keep], tracks.velocity_mps[keep]
+    objects = [
+        TrackedObject(
+            track_id=track_id,
+            class_=_LABELS[kind],
+            position=Position(x=x, y=y, distance=distance),
+            velocity=Velocity(x=vx, y=vy, speed=speed),
+            history=_points(history.get(track_id, ())),
+        )
+        for track_id, kind, (x, y), distance, (vx, vy), speed in zip(
+            tracks.id[keep].tolist(),
+            tracks.kind[keep].tolist(),
+            _rounded(xy, 3),
+            _rounded(np.hypot(xy[:, 0], xy[:, 1]), 3),
+            _rounded(velocity, 3),
+            _rounded(np.hypot(velocity[:, 0], velocity[:, 1]), 3),
+            strict=True,
+        )
+    ]
+    return TracksMessage(
+        timestamp=rfc3339(unix_s), frame_number=frame_number, state=state, objects=objects
+    )
+
+
+def state_message(
+    decision: Decision,
+    *,
+    since_unix_s: float,
+    config_hash: str,
+    shown: ShownState | None = None,
+    sentence: str | None = None,
+) -> StateMessage:
+    """The state message: what the light shows since `since_unix_s` (seconds since 1970).
+
+    `shown` and `sentence` replace the decision's own where the light says something else: FAULT
+    with its cause, or OFF. A pair belongs to a decision, so FAULT and OFF carry none.
+    """
+    state = shown or _STATES[decision.state]
+    pair = None if state in ("FAULT", "OFF") else decision.pair
+    return StateMessage(
+        state=state,
+        since=rfc3339(since_unix_s),
+        pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
+        distance_m=None if pair is None else _number(pair.distance_m, 3),
+        config_hash=config_hash,
+        sentence=decision.sentence if sentence is None else sentence,
+    )
+
+
+def health_message(
+    *,
+    unix_s: float,
+    state: ShownState,
+    version: str,
+    config_hash: str,
+    uptime_s: float,
+    fps: float,
+    latency_ms: Mapping[str, Mapping[str, float]],
+    camera: Part,
+    capture_age_ms: float | None,
+    detector: Part,
+    light: Part,
+    faults: Iterable[str],
+    counters: Counters,
+) -> HealthMessage:
+    """The health message at `unix_s`; `latency_ms` is what `StageTimes.percentiles` returns."""
+    return HealthMessage(
+        timestamp=rfc3339(unix_s),
+        state=state,
+        version=version,
+        config_hash=config_hash,
+        uptime_s=_number(uptime_s, 1) or 0.0,
+        fps=_number(fps, 2) or 0.0,
+        latency_ms={
+            stage: StageLatency(
+                **{key: _number(row[key], 2) or 0.0 for key in ("p50", "p95", "p99", "max")}
+            )
+            for stage, row in latency_ms.items()
+        },
+        camera=CameraHealth(
+            ok=camera.ok,
+            detail=camera.detail,
+            capture_age_ms=None if capture_age_ms is None else _number(capture_age_ms, 1),
+        ),
+        detector=detector,
+        light=light,
+        faults=list(faults),
+        counters=counters,
+    )
+
+
+def event_header(
+    *,
+    config_hash: str,
+    calibration_hash: str | None,
+    model_hash: str | None,
+    version: str,
+    started_unix_s: float,
+) -> EventHeader:
+    """The header of a run that started at `started_unix_s` (seconds since 1970)."""
+    return EventHeader(
+        format="bikeped-events/1",
+        config_hash=config_hash,
+        calibration_hash=calibration_hash,
+        model_hash=model_hash,
+        version=version,
+        started_at=rfc3339(started_unix_s),
+    )
+
+
+def event_line(
+    *,
+    t_s: float,
+    frame: int,
+    decision: Decision,
+    tracks: Tracks,
+    detections: Detections,
+    latency_ms: Mapping[str, float],
+    shown: ShownState | None = None,
+    sentence: str | None = None,
+) -> EventLine:
+    """The event line of one frame, `t_s` seconds after the start.
+
+    `shown` and `sentence` replace the decision's own where the light says something else (FAULT).
+    Tracks without finite numbers are left out, as in `tracks_message`.
+    """
+    keep = _finite(tracks)
+    pair = decision.pair
+    return EventLine(
+        t=_number(t_s, 4) or 0.0,
+        frame=frame,
+        state=shown or _STATES[decision.state],
+        pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
+        tracks=[
+            EventTrack(id=track_id, kind=_LABELS[kind], x=x, y=y, vx=vx, vy=vy, lost=lost)
+            for track_id, kind, (x, y), (vx, vy), lost in zip(
+                tracks.id[keep].tolist(),
+                tracks.kind[keep].tolist(),
+                _rounded(tracks.xy_m[keep], 3),
+                _rounded(tracks.velocity_mps[keep], 3),
+                (tracks.unseen_s[keep] > 0).tolist(),
+                strict=True,
+            )
+        ],
+        detections=[
+            EventDetection(kind=_LABELS[kind], confidence=confidence, box=tuple(box))
+            for kind, confidence, box in zip(
+                detections.kind.tolist(),
+                _rounded(detections.confidence, 4),
+                _rounded(detections.box_px, 1),
+                strict=True,
+            )
+        ],
+        sentence=decision.sentence if sentence is None else sentence,
+        latency_ms={stage: _number(ms, 3) or 0.0 for stage, ms in latency_ms.items()},
+    )
+
+
+def parse_event(line: bytes | str) -> EventHeader | EventLine:
+    """One line of an event file, header or frame.
+
+    Raises TelemetryError, saying which key is wrong, for a line that is neither.
+    """
+    try:
+        raw = _decoder.decode(line)
+        if isinstance(raw, dict) and "format" in raw:
+            return msgspec.convert(raw, EventHeader)
+        return msgspec.convert(raw, EventLine)
+    except msgspec.MsgspecError as exc:
+        raise TelemetryError(
+            f"not an event line ({exc}): give a file that --events or the audit log wrote"
+        ) from exc
+
+
+def decision_view(line: bytes | str) -> bytes:
+    """An event line without what differs between two runs of one recording (`VOLATILE_KEYS`).
+
+    Two replays of one recording with one configuration are equal line by line in this view.
+    Raises TelemetryError for a line that is not a JSON object.
+    """
+    try:
+        raw: Any = _decoder.decode(line)
+    except msgspec.DecodeError as exc:
+        raise TelemetryError(f"not an event line ({exc}): give a file of event lines") from exc
+    if not isinstance(raw, dict):
+        raise TelemetryError("not an event line (no JSON object): give a file of event lines")
+    return _encoder.encode({key: value for key, value in raw.items() if key not in VOLATILE_KEYS})
+
+
+def decision_digest(lines: Iterable[bytes | str]) -> str:
+    """SHA-256, in hexadecimal, of the `decision_view` of all lines; blank lines do not count.
+
+    Equal digests mean equal decisions; an opened event file is such an iterable.
+    """
+    digest = hashlib.sha256()
+    for line in lines:
+        if line.strip():
+            digest.update(decision_view(line) + b"\n")
+    return digest.hexdigest()
+
+
+def _finite(tracks: Tracks) -> npt.NDArray[np.bool_]:
+    numbers = np.concatenate([tracks.xy_m, tracks.velocity_mps], axis=1)
+    return np.asarray(np.isfinite(numbers).all(axis=1))
+
+
+def _rounded(values: npt.NDArray[Any] | Sequence[Any], decimals: int) -> list[Any]:
+    # + 0.0 turns -0.0 into 0.0: two ways of computing one position must not differ in a sign.
+    rounded: list[Any] = (np.round(np.asarray(values, np.float64), decimals) + 0.0).tolist()
+    return rounded
+
+
+def _points(values: Sequence[Sequence[float]] | FloatArray) -> list[tuple[float, float]]:
+    if len(values) == 0:
+        return []
+    array = np.asarray(values, np.float64)
+    return [(x, y) for x, y in _rounded(array[np.isfinite(array).all(axis=1)], 3)]
+
+
+def _number(value: float, decimals: int) -> float | None:
+    """`value` rounded, or None where JSON has no number for it."""
+    return round(float(value), decimals) + 0.0 if math.isfinite(value) else None

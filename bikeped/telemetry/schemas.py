@@ -1,0 +1,80 @@
+"""JSON Schemas of all messages, from the very types that build them.
+
+`python -m bikeped.telemetry.schemas docs/messages` writes one file a message.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from bikeped.errors import TelemetryError
+from bikeped.telemetry import messages
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+#: file name (before .schema.json) -> type of the payload
+MESSAGES: dict[str, Any] = {
+    "tracks": messages.TracksMessage,
+    "state": messages.StateMessage,
+    "health": messages.HealthMessage,
+    "availability": messages.Availability,
+    "event-header": messages.EventHeader,
+    "event-frame": messages.EventLine,
+}
+
+
+def schema(name: str) -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of one message by its name in `MESSAGES`."""
+    body = msgspec.json.schema(MESSAGES[name])
+    return {"$schema": DIALECT, "title": f"bikeped {name}", **body}
+
+
+def schema_files() -> dict[str, str]:
+    """File name -> text of every schema, as `write` writes them."""
+    return {
+        f"{name}.schema.json": json.dumps(schema(name), indent=2, ensure_ascii=False) + "\n"
+        for name in MESSAGES
+    }
+
+
+def write(directory: Path) -> list[Path]:
+    """Writes every schema into `directory`, creating it; returns the paths.
+
+    Raises TelemetryError when the directory cannot be written.
+    """
+    written = []
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for file_name, text in schema_files().items():
+            path = directory / file_name
+            path.write_text(text, encoding="utf-8")
+            written.append(path)
+    except OSError as exc:
+        raise TelemetryError(
+            f"{exc.filename or directory}: cannot write the schemas ({exc.strerror}): "
+            "give a directory that you may write"
+        ) from exc
+    return written
+
+
+def main(arguments: list[str]) -> int:
+    """Writes the schemas into the one directory named; returns the exit status."""
+    if len(arguments) != 1:
+        print("usage: python -m bikeped.telemetry.schemas DIRECTORY", file=sys.stderr)
+        return TelemetryError.exit_status
+    try:
+        for path in write(Path(arguments[0])):
+            print(path)
+    except TelemetryError as exc:
+        print(exc, file=sys.stderr)
+        return exc.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,193 @@
+"""A real mosquitto, a proxy that can misbehave before it, and a subscriber."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import socket
+import struct
+import subprocess
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
+DEADLINE_S = 30.0  # generous: reached only by a failure
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Broker:
+    """One mosquitto process on one port; can be killed and started again."""
+
+    def __init__(self, directory: Path, lines: tuple[str, ...] = ("allow_anonymous true",)) -> None:
+        assert MOSQUITTO is not None
+        self.directory = directory
+        self.port = free_port()
+        # Started as root it would otherwise become a user who cannot read the test's files.
+        options = ("user root", "persistence false", f"listener {self.port} 127.0.0.1", *lines)
+        self.config = directory / "mosquitto.conf"
+        self.config.write_text("\n".join(options) + "\n")
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        with (self.directory / "mosquitto.log").open("ab") as output:
+            self.process = subprocess.Popen(
+                [str(MOSQUITTO), "-c", str(self.config)], stdout=output, stderr=output
+            )
+        deadline = time.monotonic() + DEADLINE_S
+        while True:
+            with contextlib.suppress(OSError):
+                socket.create_connection(("127.0.0.1", self.port), 1).close()
+                return
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                pytest.fail((self.directory / "mosquitto.log").read_text())
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+
+@pytest.fixture(scope="session")
+def need_mosquitto() -> None:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed: apt-get install mosquitto")
+
+
+@pytest.fixture
+def make_broker(need_mosquitto: None, tmp_path: Path) -> Iterator[Callable[..., Broker]]:
+    """Starts brokers of the test's own, for tests that kill or configure them."""
+    brokers: list[Broker] = []
+
+    def make(*lines: str) -> Broker:
+        directory = tmp_path / f"broker{len(brokers)}"
+        directory.mkdir()
+        brokers.append(Broker(directory, lines or ("allow_anonymous true",)))
+        brokers[-1].start()
+        return brokers[-1]
+
+    yield make
+    for broker in brokers:
+        broker.kill()
+
+
+@pytest.fixture(scope="session")
+def broker(need_mosquitto: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """One broker for all tests that only talk to it; each test uses a site of its own."""
+    shared = Broker(tmp_path_factory.mktemp("broker"))
+    shared.start()
+    yield shared
+    shared.kill()
+
+
+class Proxy:
+    """Passes bytes between clients and a broker until told to hang or to abort."""
+
+    def __init__(self, target_port: int) -> None:
+        self.target_port = target_port
+        self.port = 0
+        self.flowing = asyncio.Event()
+        self.flowing.set()
+        self.accepted = asyncio.Event()
+        self._server: asyncio.Server | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._client_sides: list[asyncio.StreamWriter] = []
+        self._broker_sides: list[asyncio.StreamWriter] = []
+
+    async def start(self) -> None:
+        self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._client_sides.append(writer)
+        up_reader, up_writer = await asyncio.open_connection("127.0.0.1", self.target_port)
+        self._broker_sides.append(up_writer)
+        for source, sink in ((reader, up_writer), (up_reader, writer)):
+            task = asyncio.create_task(self._pump(source, sink))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        self.accepted.set()
+
+    async def _pump(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):
+            while data := await source.read(4096):
+                await self.flowing.wait()
+                sink.write(data)
+                await sink.drain()
+
+    def abort_clients(self) -> None:
+        """Clients are cut off; their connections to the broker stay half open."""
+        for writer in self._client_sides:
+            writer.transport.abort()
+        self._client_sides.clear()
+
+    def abort_broker_side(self) -> None:
+        """What the broker sees when a client is killed: a reset (linger 0), no DISCONNECT."""
+        for writer in self._broker_sides:
+            sock = writer.get_extra_info("socket")
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            writer.transport.abort()
+        self._broker_sides.clear()
+
+    async def close(self) -> None:
+        assert self._server is not None
+        self._server.close()
+        self.abort_clients()
+        self.abort_broker_side()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._server.wait_closed()
+
+
+@pytest.fixture
+async def make_proxy() -> AsyncIterator[Callable[[int], Proxy]]:
+    proxies: list[Proxy] = []
+
+    def make(target_port: int) -> Proxy:
+        proxies.append(Proxy(target_port))
+        return proxies[-1]
+
+    yield make
+    for proxy in proxies:
+        await proxy.close()
+
+
+class Listener:
+    """A subscriber that remembers all it received, and can wait for more."""
+
+    def __init__(self, client: aiomqtt.Client) -> None:
+        self.client = client
+        self.received: list[tuple[str, bytes, bool]] = []  # topic, payload, retained
+
+    async def until(self, done: Callable[[list[tuple[str, bytes, bool]]], bool]) -> None:
+        async def receive() -> None:
+            while not done(self.received):
+                message = await anext(self.client.messages)
+                self.received.append((message.topic.value, message.payload, message.retain))
+
+        await asyncio.wait_for(receive(), DEADLINE_S)
+
+    def payloads(self, suffix: str) -> list[bytes]:
+        return [payload for topic, payload, _ in self.received if topic.endswith(f"/{suffix}")]
+
+
+@pytest.fixture
+def listen() -> Callable[..., contextlib.AbstractAsyncContextManager[Listener]]:
+    @contextlib.asynccontextmanager
+    async def subscribe(port: int, topic: str, **options: object) -> AsyncIterator[Listener]:
+        async with aiomqtt.Client("127.0.0.1", port, **options) as client:
+            await client.subscribe(topic, qos=1)
+            yield Listener(client)
+
+    return subscribe
