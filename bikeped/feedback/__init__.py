@@ -1,0 +1,75 @@
+"""What the road user sees and hears: states to signals, lights, the speaker.
+
+`signal` is pure and decides FAULT; `light` drives a device from its own thread; `gpio`, `usb` and
+`SimulatedLight` are devices; `speaker` plays the sounds of `sounds`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bikeped.feedback.gpio import GpioLight, gpio_lamps
+from bikeped.feedback.light import Light, LightDriver, SimulatedLight
+from bikeped.feedback.signal import OFF, SignalLogic, assess, fault_signal
+from bikeped.feedback.speaker import Speaker
+from bikeped.feedback.usb import UsbLight, relay_lamps
+
+if TYPE_CHECKING:
+    from bikeped.config.sections import FeedbackConfig
+
+__all__ = [
+    "OFF",
+    "GpioLight",
+    "Light",
+    "LightDriver",
+    "SignalLogic",
+    "SimulatedLight",
+    "Speaker",
+    "UsbLight",
+    "assess",
+    "check_light",
+    "fault_signal",
+    "light_driver",
+    "open_light",
+    "open_speaker",
+]
+
+
+def check_light(config: FeedbackConfig) -> None:
+    """Whether the wiring in the configuration can show what it must; touches no device.
+
+    Raises FeedbackError naming the key.
+    """
+    if config.light == "gpio":
+        gpio_lamps(config.gpio)
+    elif config.light == "usb" and config.usb.device == "relay":
+        relay_lamps(config.usb)
+
+
+def open_light(config: FeedbackConfig) -> Light:
+    """Opens the configured light; FeedbackError when it is not there or does not answer.
+
+    Its `close` darkens it, whatever colour it had before.
+    """
+    if config.light == "gpio":
+        return GpioLight(config.gpio)
+    if config.light == "usb":
+        return UsbLight(config.usb)
+    return SimulatedLight()
+
+
+def light_driver(config: FeedbackConfig) -> LightDriver:
+    """The driver of the configured light, not yet started.
+
+    Raises FeedbackError when the wiring is wrong, which no retry mends. A device that is missing or
+    fails is no reason to stop: the driver retries for ever and reports it in `fault`.
+    """
+    check_light(config)
+    return LightDriver(partial(open_light, config), fault_blink_hz=config.fault_blink_hz)
+
+
+def open_speaker(config: FeedbackConfig, base: Path | None = None) -> Speaker:
+    """The configured speaker; relative WAV paths start from `base`, the configuration's folder."""
+    return Speaker(config.sound, base=base)

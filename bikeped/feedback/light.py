@@ -1,0 +1,335 @@
+"""The light: what a device must do, which lamp shows which colour, and the thread that drives it.
+
+`LightDriver` runs one thread of its own. It blinks without anybody's help, it is the only place
+that calls the device (a device that hangs blocks this thread and nothing else), and it is the
+deadman: when nobody has called `show` for `deadman_s`, the light turns to FAULT by itself. That has
+to be a thread and not an asyncio task, because a stuck event loop is the very case it is there
+for. What it cannot cover is a process that has died or whose interpreter is stuck: systemd's
+watchdog ends that process, and `python -m bikeped.feedback` (ExecStopPost) then darkens the light.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Protocol, TypeVar
+
+from bikeped.errors import FeedbackError
+from bikeped.feedback.signal import fault_signal
+from bikeped.types import Colour, Signal
+
+_log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
+
+#: A GPIO line by name or offset, or a relay by number; None is not wired.
+Lamp = str | int | None
+
+#: The fault of a light that nobody refreshes; a text for people and for telemetry.
+DEADMAN = "light: not refreshed by the service"
+
+LAMP_COLOURS = (Colour.RED, Colour.ORANGE, Colour.GREEN, Colour.BLUE)
+
+
+class Light(Protocol):
+    """A light as a device: one colour at a time.
+
+    Both methods raise FeedbackError when the device does not obey; after that the light is closed
+    and opened anew.
+    """
+
+    def set(self, colour: Colour) -> None:
+        """Shows `colour` and nothing else; `Colour.OFF` is dark. May take as long as it likes."""
+
+    def close(self) -> None:
+        """Switches off and lets the device go."""
+
+
+class SimulatedLight:
+    """A light that only writes to the log."""
+
+    def __init__(self) -> None:
+        self.colour = Colour.OFF
+        self._lit = Colour.OFF
+
+    def set(self, colour: Colour) -> None:
+        # The dark half of blinking is no news: a FAULT that lasts a month is one line.
+        if colour not in (Colour.OFF, self._lit):
+            _log.info("simulated light: %s", colour.value)
+            self._lit = colour
+        self.colour = colour
+
+    def close(self) -> None:
+        _log.info("simulated light: off")
+        self.colour = self._lit = Colour.OFF
+
+
+def assign_lamps(wired: Mapping[Colour, Lamp], section: str) -> dict[Colour, Lamp]:
+    """Which lamp shows which colour, given the lamps that are wired; None is dark.
+
+    Without an orange lamp its signals (WARNING, FAULT) go to red, which never reassures. Green and
+    blue fall back to dark. Raises FeedbackError when red is missing, since then nothing could show
+    an ALERT, and when two colours share a lamp. `section` is the configuration section to name.
+    """
+    lamps = {colour: wired.get(colour) for colour in LAMP_COLOURS}
+    if lamps[Colour.RED] is None:
+        raise FeedbackError(
+            f"{section}: no red lamp is wired, so no ALERT could be shown; set the key of red"
+        )
+    seen: dict[str | int, Colour] = {}
+    for colour, lamp in lamps.items():
+        if lamp is None:
+            continue
+        if lamp in seen:
+            raise FeedbackError(
+                f"{section}: {seen[lamp].value} and {colour.value} are both on {lamp!r}; give each "
+                "its own, or leave one out"
+            )
+        seen[lamp] = colour
+    if lamps[Colour.ORANGE] is None:
+        lamps[Colour.ORANGE] = lamps[Colour.RED]
+    return {**lamps, Colour.OFF: None}
+
+
+class LightDriver:
+    """Shows signals on a light, from its own thread, and reports when the light does not obey.
+
+    `open_light` makes the device; it is called in the thread, at the start and after every error,
+    with pauses that double from `retry_s[0]` to `retry_s[1]` seconds. `deadman_s`: without a `show`
+    for this long the light shows FAULT. `hang_s`: a device call that takes longer is a fault.
+    `assert_s`: an unchanged colour is sent again this often, so that a light that was unplugged
+    while steady is noticed, and one that came back shows the truth.
+
+    The queue to the thread is one signal long: the newest replaces one that was not yet shown.
+    """
+
+    def __init__(
+        self,
+        open_light: Callable[[], Light],
+        *,
+        fault_blink_hz: float = 0.5,
+        deadman_s: float = 1.0,
+        hang_s: float = 2.0,
+        assert_s: float = 2.0,
+        retry_s: tuple[float, float] = (0.5, 30.0),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._open_light = open_light
+        self._deadman_signal = fault_signal((DEADMAN,), fault_blink_hz)
+        self._deadman_s = deadman_s
+        self._hang_s = hang_s
+        self._assert_s = assert_s
+        self._retry_s = retry_s
+        self._clock = clock
+
+        # Shared with the caller, guarded by the condition's lock.
+        self._changed = threading.Condition()
+        self._signal: Signal | None = None
+        self._shown_s = clock()
+        self._closing = False
+        self._busy_since: float | None = None
+        self._error: str | None = None
+        self._errors = 0
+        self._deadman_trips = 0
+
+        # The thread's own.
+        self._light: Light | None = None
+        self._applied: Colour | None = None
+        self._applied_s = 0.0
+        self._pattern: tuple[Colour, float] = (Colour.OFF, 0.0)
+        self._pattern_s = 0.0
+        self._retry_at_s: float | None = None
+        self._pause_s = retry_s[0]
+        self._deadman = False
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Starts the thread; the light is opened there and shows FAULT until the first `show`."""
+        if self._thread is not None:
+            raise RuntimeError("a LightDriver starts once")
+        # A daemon: a device that hangs for good must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name="bikeped-light", daemon=True)
+        self._thread.start()
+
+    def show(self, signal: Signal) -> None:
+        """Shows `signal` from now on and holds the deadman off. Returns at once, always."""
+        with self._changed:
+            old = self._signal
+            self._signal = signal
+            self._shown_s = self._clock()
+            # At 30 calls a second the thread is only woken when there is something to do.
+            if self._deadman or old is None or _pattern_of(old) != _pattern_of(signal):
+                self._changed.notify()
+
+    @property
+    def fault(self) -> str | None:
+        """What is wrong with the light now, for health and the log; None when it obeys."""
+        with self._changed:
+            if self._thread is not None and not self._thread.is_alive() and not self._closing:
+                return "light: its thread has ended; restart the service"
+            if self._busy_since is not None and self._clock() - self._busy_since > self._hang_s:
+                return f"light: the device has not answered for more than {self._hang_s:g} s"
+            return self._error
+
+    @property
+    def errors(self) -> int:
+        """Device calls that failed, since the start."""
+        return self._errors
+
+    @property
+    def deadman_trips(self) -> int:
+        """How often the light turned to FAULT because nobody called `show`."""
+        return self._deadman_trips
+
+    @property
+    def colour(self) -> Colour | None:
+        """The colour that the device confirmed last; None when unknown."""
+        return self._applied
+
+    def close(self, timeout_s: float = 2.0) -> bool:
+        """Switches the light off and ends the thread; False when the device hangs.
+
+        Waits at most `timeout_s`: from asyncio, call it by `asyncio.to_thread`.
+        """
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        if self._thread is None:
+            return True
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def step(self, now_s: float) -> float:
+        """What the thread does at `now_s`: brings the light up to date.
+
+        Returns the time at which it wants to be called again. Only the thread calls this, and
+        tests that bring their own clock instead of a thread.
+        """
+        signal, deadman_at_s = self._effective(now_s)
+        if _pattern_of(signal) != self._pattern:
+            self._pattern = _pattern_of(signal)
+            self._pattern_s = now_s
+        colour, edge_s = _phase(self._pattern, self._pattern_s, now_s)
+        wake_s = [edge_s, deadman_at_s, self._bring(colour, now_s)]
+        return min(wake_s)
+
+    def _effective(self, now_s: float) -> tuple[Signal, float]:
+        """The signal that counts at `now_s`, and when the deadman would trip."""
+        with self._changed:
+            signal, shown_s = self._signal, self._shown_s
+            stale = now_s - shown_s >= self._deadman_s
+            was, self._deadman = self._deadman, stale and signal is not None
+        # Logged outside the lock: a log that blocks must not block `show`.
+        if self._deadman and not was:
+            self._deadman_trips += 1
+            _log.error("%s for %g s; the light shows FAULT", DEADMAN, self._deadman_s)
+        elif was and not self._deadman:
+            _log.warning("light: refreshed again after the deadman had tripped")
+        if stale or signal is None:
+            return self._deadman_signal, float("inf")
+        return signal, shown_s + self._deadman_s
+
+    def _bring(self, colour: Colour, now_s: float) -> float:
+        """Makes the device show `colour`, if it does not already; returns when to look again."""
+        if self._retry_at_s is not None and now_s < self._retry_at_s:
+            return self._retry_at_s
+        if colour == self._applied and 0 <= now_s - self._applied_s < self._assert_s:
+            return self._applied_s + self._assert_s
+        try:
+            if self._light is None:
+                self._light = self._call(self._open_light)
+            light = self._light
+            self._call(lambda: light.set(colour))
+        except FeedbackError as error:
+            return self._failed(str(error), now_s)
+        except Exception as error:  # noqa: BLE001 - a bug must not end the deadman's thread
+            _log.debug("light: unexpected error", exc_info=True)
+            return self._failed(f"light: {type(error).__name__}: {error}", now_s)
+        self._succeeded()
+        self._applied, self._applied_s = colour, now_s
+        return now_s + self._assert_s
+
+    def _call(self, action: Callable[[], _T]) -> _T:
+        with self._changed:
+            self._busy_since = self._clock()
+        try:
+            return action()
+        finally:
+            with self._changed:
+                self._busy_since = None
+
+    def _succeeded(self) -> None:
+        self._retry_at_s = None
+        self._pause_s = self._retry_s[0]
+        if self._error is not None:
+            _log.warning("light: works again")
+            with self._changed:
+                self._error = None
+
+    def _failed(self, text: str, now_s: float) -> float:
+        with self._changed:
+            known, self._error = self._error, text
+            self._errors += 1
+        if text != known:
+            _log.error("%s", text)
+        self._release()
+        self._applied = None
+        self._retry_at_s = now_s + self._pause_s
+        self._pause_s = min(2 * self._pause_s, self._retry_s[1])
+        return self._retry_at_s
+
+    def _release(self) -> None:
+        light, self._light = self._light, None
+        if light is None:
+            return
+        try:
+            self._call(light.close)
+        except FeedbackError as error:
+            _log.debug("light: closing failed: %s", error)
+        except Exception as error:  # noqa: BLE001 - as in _bring
+            _log.warning("light: closing failed: %s: %s", type(error).__name__, error)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                if self._closing:
+                    break
+            wake_s = self.step(self._clock())
+            with self._changed:
+                wait_s = wake_s - self._clock()
+                if not self._closing and wait_s > 0 and not self._has_news():
+                    # Bounded, so that a clock that misbehaves cannot silence the deadman.
+                    self._changed.wait(min(wait_s, self._deadman_s))
+        if self._light is None and self._error is not None:
+            # A relay keeps its last colour while it cannot be reached: one more try to darken it.
+            self._retry_at_s = None
+            self._bring(Colour.OFF, self._clock())
+        self._release()
+        self._applied = None
+
+    def _has_news(self) -> bool:
+        """Whether another pattern is due than the one that the last step began with."""
+        signal = self._signal
+        if signal is None or self._clock() - self._shown_s >= self._deadman_s:
+            signal = self._deadman_signal
+        return _pattern_of(signal) != self._pattern
+
+
+def _pattern_of(signal: Signal) -> tuple[Colour, float]:
+    return signal.colour, signal.blink_hz
+
+
+def _phase(pattern: tuple[Colour, float], since_s: float, now_s: float) -> tuple[Colour, float]:
+    """The colour of a pattern that began at `since_s`, and when it changes next.
+
+    Blinking is lit for the first half of each period, so a new signal shows at once.
+    """
+    colour, blink_hz = pattern
+    if blink_hz <= 0 or colour is Colour.OFF:
+        return colour, float("inf")
+    half_s = 0.5 / blink_hz
+    # The epsilon keeps a wake-up that comes at the very edge on the far side of it.
+    half = int((now_s - since_s) / half_s + 1e-6)
+    return (colour if half % 2 == 0 else Colour.OFF), since_s + (half + 1) * half_s

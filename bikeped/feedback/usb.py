@@ -1,0 +1,277 @@
+"""USB lights and relay boards, by pyusb: no kernel driver, no vendor's library.
+
+Protocols, each from its public description:
+
+* ThingM blink(1), 27b8:01ed: feature report 1 of 8 bytes, `{1, 'n', r, g, b, 0, 0, 0}` sets the
+  colour at once. Source: ThingM's docs/blink1-hid-commands.md in github.com/todbot/blink1.
+* Luxafor Flag, 04d8:f372: 8 bytes written to the interrupt endpoint, `{0x01, led, r, g, b, 0, 0,
+  0}` with led 0xFF for all. Source: docs.rs/luxafor, module `usb_hid` (MIT).
+* HID relay board, 16c0:05df, product `USBRelay<n>`: feature report of 8 bytes, `{0xFF, n}` closes
+  relay n and `{0xFD, n}` opens it; read back, bytes 0..4 are the board's serial number and bit n-1
+  of byte 7 is relay n. Source: github.com/JPEWdev/pyhid-usb-relay (MIT). The USB ID is shared by
+  all V-USB HID devices, so the product's name is checked as well.
+
+Feature reports travel as HID class requests SET_REPORT and GET_REPORT to the interface (USB HID
+1.11, section 7.2). Every transfer ends after `TIMEOUT_MS`. Every error makes the light unusable:
+`LightDriver` closes it and opens a new one, which is also how a re-plugged device is found again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from typing import TYPE_CHECKING, Any, Protocol
+
+from bikeped.errors import FeedbackError
+from bikeped.feedback.light import Lamp, assign_lamps
+from bikeped.types import Colour
+
+if TYPE_CHECKING:
+    from bikeped.config.sections import UsbConfig
+
+SECTION = "feedback.usb"
+TIMEOUT_MS = 300
+
+_INTERFACE = 0
+_SET_REPORT, _GET_REPORT = 0x09, 0x01
+_CLASS_INTERFACE_OUT, _CLASS_INTERFACE_IN = 0x21, 0xA1
+_FEATURE = 3
+
+#: Red, green and blue of each colour; orange is redder than on a screen, where LEDs look yellow.
+_RGB: dict[Colour, tuple[int, int, int]] = {
+    Colour.OFF: (0, 0, 0),
+    Colour.BLUE: (0, 0, 255),
+    Colour.GREEN: (0, 255, 0),
+    Colour.ORANGE: (255, 80, 0),
+    Colour.RED: (255, 0, 0),
+}
+
+_IDS = {"blink1": (0x27B8, 0x01ED), "luxafor": (0x04D8, 0xF372), "relay": (0x16C0, 0x05DF)}
+_NAMES = {
+    "blink1": "blink(1) 27b8:01ed",
+    "luxafor": "Luxafor Flag 04d8:f372",
+    "relay": "HID relay board 16c0:05df",
+}
+
+
+def relay_lamps(config: UsbConfig) -> dict[Colour, Lamp]:
+    """The relay of each colour, 1 to 8, None for dark; FeedbackError when red is not wired."""
+    wired = {
+        Colour.RED: config.relay_red or None,
+        Colour.ORANGE: config.relay_orange or None,
+        Colour.GREEN: config.relay_green or None,
+        Colour.BLUE: config.relay_blue or None,
+    }
+    return assign_lamps(wired, SECTION)
+
+
+class _Protocol(Protocol):
+    """How one kind of device is told a colour."""
+
+    def show(self, colour: Colour) -> None: ...
+
+
+class UsbLight:
+    """A USB light or relay board, opened and claimed; raises FeedbackError when it is not there.
+
+    `backend` takes a pyusb backend in place of libusb (tests).
+    """
+
+    def __init__(self, config: UsbConfig, *, backend: Any = None) -> None:
+        self._name = _NAMES[config.device]
+        self._core, self._util = _load_pyusb()
+        lamps = relay_lamps(config) if config.device == "relay" else {}
+        with self._errors("cannot be opened"):
+            self._device = self._find(config, backend)
+            try:
+                self._claim()
+                self._protocol: _Protocol = self._speak(config, lamps)
+            except BaseException:
+                self._util.dispose_resources(self._device)
+                raise
+
+    def set(self, colour: Colour) -> None:
+        """Shows `colour`; at most a few transfers of 0.3 s each."""
+        with self._errors(f"{colour.value} cannot be set"):
+            self._protocol.show(colour)
+
+    def close(self) -> None:
+        """Switches off and lets the device go."""
+        try:
+            self.set(Colour.OFF)
+        finally:
+            self._util.dispose_resources(self._device)
+
+    def _find(self, config: UsbConfig, backend: Any) -> Any:
+        """The one device that fits kind and serial number."""
+        vendor, product = _IDS[config.device]
+        strangers: list[str] = []
+        devices = self._core.find(
+            find_all=True, idVendor=vendor, idProduct=product, backend=backend
+        )
+        for device in devices:
+            # pyusb's default of 1 s also covers the string descriptors read here.
+            device.default_timeout = TIMEOUT_MS
+            if config.device == "relay" and not str(device.product or "").startswith("USBRelay"):
+                strangers.append(f"a {device.product}")
+            elif config.serial is None:
+                return device
+            else:
+                serial = self._serial(config, device)
+                if serial == config.serial:
+                    return device
+                strangers.append(f"serial {serial}")
+            self._util.dispose_resources(device)
+        wanted = self._name if config.serial is None else f"{self._name}, serial {config.serial},"
+        others = f" (found {', '.join(strangers)})" if strangers else ""
+        raise FeedbackError(f"{SECTION}.device: no {wanted} is plugged in{others}")
+
+    def _serial(self, config: UsbConfig, device: Any) -> str:
+        if config.device != "relay":
+            return str(device.serial_number)
+        # The board's USB serial number is the same on all of them; its own is in the report.
+        _detach(device)
+        report = _get_feature(device, 0, 8)
+        return bytes(report[:5]).rstrip(b"\0").decode("ascii", "replace")
+
+    def _claim(self) -> None:
+        _detach(self._device)
+        self._util.claim_interface(self._device, _INTERFACE)
+
+    def _speak(self, config: UsbConfig, lamps: dict[Colour, Lamp]) -> _Protocol:
+        if config.device == "blink1":
+            return _Blink1(self._device)
+        if config.device == "luxafor":
+            return _Luxafor(self._device, self._out_endpoint())
+        relays = {colour: lamp for colour, lamp in lamps.items() if isinstance(lamp, int)}
+        return _Relays(self._device, relays)
+
+    def _out_endpoint(self) -> int:
+        interface = self._device.get_active_configuration()[(_INTERFACE, 0)]
+        for endpoint in interface:
+            address = int(endpoint.bEndpointAddress)
+            if self._util.endpoint_direction(address) == self._util.ENDPOINT_OUT:
+                return address
+        raise FeedbackError(f"{SECTION}.device: this {self._name} has no output endpoint")
+
+    def _errors(self, what: str) -> contextlib.AbstractContextManager[None]:
+        return _as_feedback_error(f"{SECTION}: {self._name} {what}", self._core)
+
+
+class _Blink1:
+    """ThingM blink(1): one feature report a colour."""
+
+    def __init__(self, device: Any) -> None:
+        self._device = device
+
+    def show(self, colour: Colour) -> None:
+        _set_feature(self._device, 1, bytes([1, ord("n"), *_RGB[colour], 0, 0, 0]))
+
+
+class _Luxafor:
+    """Luxafor Flag: one interrupt transfer a colour."""
+
+    _STATIC, _ALL_LEDS = 0x01, 0xFF
+
+    def __init__(self, device: Any, endpoint: int) -> None:
+        self._device = device
+        self._endpoint = endpoint
+
+    def show(self, colour: Colour) -> None:
+        packet = bytes([self._STATIC, self._ALL_LEDS, *_RGB[colour], 0, 0, 0])
+        self._device.write(self._endpoint, packet, TIMEOUT_MS)
+
+
+class _Relays:
+    """HID relay board: one relay a colour, read back after every change.
+
+    Only relays that must change are switched, for mechanical ones wear, and only those that are
+    wired to a colour: what else hangs on the board is none of our business.
+    """
+
+    _ON, _OFF = 0xFF, 0xFD
+
+    def __init__(self, device: Any, relays: dict[Colour, int]) -> None:
+        self._device = device
+        self._relays = relays
+
+    def show(self, colour: Colour) -> None:
+        lamp = self._relays.get(colour)
+        state = self._state()
+        # The dark ones first, so two lamps never show at once.
+        for relay in sorted(set(self._relays.values()) - {lamp}):
+            if state & _bit(relay):
+                self._switch(relay, self._OFF)
+        if lamp is not None and not state & _bit(lamp):
+            self._switch(lamp, self._ON)
+        wanted = _bit(lamp) if lamp is not None else 0
+        ours = sum(_bit(relay) for relay in set(self._relays.values()))
+        if (got := self._state() & ours) != wanted:
+            raise FeedbackError(
+                f"{SECTION}: the relay board does not obey: relays {wanted:08b} were asked for, "
+                f"{got:08b} are on; does the board have as many relays as relay_* names?"
+            )
+
+    def _state(self) -> int:
+        return int(_get_feature(self._device, 0, 8)[7])
+
+    def _switch(self, relay: int, command: int) -> None:
+        _set_feature(self._device, 0, bytes([command, relay, 0, 0, 0, 0, 0, 0]))
+
+
+def _bit(relay: int) -> int:
+    return 1 << (relay - 1)
+
+
+def _set_feature(device: Any, report_id: int, data: bytes) -> None:
+    value = (_FEATURE << 8) | report_id
+    sent = device.ctrl_transfer(
+        _CLASS_INTERFACE_OUT, _SET_REPORT, value, _INTERFACE, data, TIMEOUT_MS
+    )
+    if sent != len(data):
+        raise FeedbackError(f"{SECTION}: only {sent} of {len(data)} bytes were taken")
+
+
+def _get_feature(device: Any, report_id: int, length: int) -> Any:
+    value = (_FEATURE << 8) | report_id
+    report = device.ctrl_transfer(
+        _CLASS_INTERFACE_IN, _GET_REPORT, value, _INTERFACE, length, TIMEOUT_MS
+    )
+    if len(report) != length:
+        raise FeedbackError(f"{SECTION}: a report of {length} bytes came with {len(report)}")
+    return report
+
+
+def _detach(device: Any) -> None:
+    """Takes the interface from the kernel's usbhid, which claims every HID device."""
+    # NotImplementedError: a backend without kernel drivers to detach.
+    with contextlib.suppress(NotImplementedError):
+        if device.is_kernel_driver_active(_INTERFACE):
+            device.detach_kernel_driver(_INTERFACE)
+
+
+def _load_pyusb() -> tuple[Any, Any]:
+    try:
+        return importlib.import_module("usb.core"), importlib.import_module("usb.util")
+    except ImportError as error:
+        raise FeedbackError(
+            "feedback.light: usb needs the Python package pyusb; install bikeped[usb]"
+        ) from error
+
+
+@contextlib.contextmanager
+def _as_feedback_error(what: str, core: Any) -> Any:
+    try:
+        yield
+    except core.NoBackendError as error:
+        raise FeedbackError(
+            f"{what}: libusb is missing; install the system package libusb-1.0-0"
+        ) from error
+    except OSError as error:
+        mend = ""
+        if error.errno == 13:
+            mend = "; install deploy/99-bikeped.rules, and is this user in group plugdev?"
+        raise FeedbackError(f"{what}: {error}{mend}") from error
+    except ValueError as error:
+        # pyusb's answer to descriptors that it cannot read.
+        raise FeedbackError(f"{what}: {error}") from error

@@ -1,0 +1,222 @@
+"""Signals: the table of states, the hold of ALERT, and what it takes to leave FAULT."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bikeped.config.sections import FeedbackConfig
+from bikeped.feedback.signal import OFF, STARTING, SignalLogic, assess, fault_signal
+from bikeped.types import Colour, Signal, Sound, State
+
+FRAME_S = 1 / 30
+CAMERA = ("camera: no frame for more than 0.5 s",)
+
+
+def recovered(**timings: float) -> tuple[SignalLogic, float]:
+    """Logic that has left FAULT showing IDLE, and the time."""
+    logic = SignalLogic(**{"recover_frames": 5, **timings})  # type: ignore[arg-type]
+    now_s = 100.0
+    for _ in range(5):
+        signal = logic.step(now_s, State.IDLE)
+        now_s += FRAME_S
+    assert signal.name == "IDLE"
+    return logic, now_s
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [
+        (State.IDLE, Signal("IDLE", Colour.BLUE)),
+        (State.SAFE, Signal("SAFE", Colour.GREEN, sound=Sound.CHIME)),
+        (State.WARNING, Signal("WARNING", Colour.ORANGE)),
+        (State.ALERT, Signal("ALERT", Colour.RED, 2.0, Sound.BELL)),
+    ],
+)
+def test_each_state_shows_as_in_the_papers_table(state: State, expected: Signal) -> None:
+    logic, now_s = recovered()
+    assert logic.step(now_s, state) == expected
+
+
+def test_off_is_dark_and_silent() -> None:
+    assert Signal("OFF", Colour.OFF) == OFF
+
+
+def test_configuration_sets_the_timings() -> None:
+    config = FeedbackConfig(blink_hz=3.0, fault_blink_hz=0.25, hold_alert_s=0.0, recover_frames=1)
+    logic = SignalLogic.from_config(config)
+    assert logic.step(0.0, None) == Signal("FAULT", Colour.ORANGE, 0.25, faults=(STARTING,))
+    assert logic.step(0.1, State.ALERT) == Signal("ALERT", Colour.RED, 3.0, Sound.BELL)
+    assert logic.step(0.2, State.IDLE).name == "IDLE"
+
+
+def test_chime_sounds_once_when_safe_begins() -> None:
+    logic, now_s = recovered()
+    states = [State.SAFE, State.SAFE, State.IDLE, State.SAFE, State.SAFE]
+    sounds = [logic.step(now_s + i * FRAME_S, state).sound for i, state in enumerate(states)]
+    assert sounds == [Sound.CHIME, Sound.NONE, Sound.NONE, Sound.CHIME, Sound.NONE]
+
+
+def test_a_tick_without_a_decision_keeps_the_state() -> None:
+    logic, now_s = recovered()
+    logic.step(now_s, State.WARNING)
+    assert logic.step(now_s + 0.3, None).name == "WARNING"
+
+
+def test_one_frame_of_alert_is_held_and_then_gives_way() -> None:
+    logic, now_s = recovered(hold_alert_s=1.0)
+    logic.step(now_s, State.ALERT)
+    assert logic.step(now_s + 0.99, State.IDLE).name == "ALERT"
+    assert logic.step(now_s + 1.0, State.IDLE).name == "IDLE"
+
+
+def test_a_clock_that_steps_back_does_not_prolong_the_hold() -> None:
+    logic, now_s = recovered(hold_alert_s=1.0)
+    logic.step(now_s, State.ALERT)
+    assert logic.step(now_s - 50, State.IDLE).name == "IDLE"
+
+
+def test_starts_in_fault_and_needs_good_frames_in_a_row() -> None:
+    logic = SignalLogic(recover_frames=3)
+    names = [
+        logic.step(0.0, None),
+        logic.step(0.1, State.IDLE),
+        logic.step(0.2, State.IDLE),
+        logic.step(0.3, None),  # a tick is no evidence, and does not undo any
+        logic.step(0.4, State.SAFE),
+    ]
+    assert [signal.name for signal in names] == ["FAULT"] * 4 + ["SAFE"]
+    assert names[0].faults == (STARTING,)
+
+
+def test_a_fault_shows_at_once_and_counting_starts_again() -> None:
+    logic, now_s = recovered()
+    fault = logic.step(now_s, None, CAMERA)
+    assert fault == Signal("FAULT", Colour.ORANGE, 0.5, faults=CAMERA)
+    good = [logic.step(now_s + i * FRAME_S, State.IDLE) for i in range(1, 5)]
+    assert {signal.name for signal in good} == {"FAULT"}
+    assert good[0].faults == (f"recovering: {CAMERA[0]}",)
+    logic.step(now_s + 0.2, None, CAMERA)
+    later = [logic.step(now_s + 1 + i * FRAME_S, State.IDLE).name for i in range(5)]
+    assert later == ["FAULT"] * 4 + ["IDLE"]
+
+
+def test_the_state_before_a_fault_is_forgotten() -> None:
+    logic, now_s = recovered(recover_frames=1)
+    logic.step(now_s, State.SAFE)
+    logic.step(now_s + 0.1, None, CAMERA)
+    assert logic.step(now_s + 0.2, None).name == "FAULT"
+
+
+def test_a_held_alert_outlives_a_fault_only_by_its_hold() -> None:
+    logic, now_s = recovered(hold_alert_s=1.0)
+    logic.step(now_s, State.ALERT)
+    during = logic.step(now_s + 0.5, None, CAMERA)
+    assert (during.name, during.faults) == ("ALERT", CAMERA)
+    assert logic.step(now_s + 1.0, None, CAMERA).name == "FAULT"
+
+
+def test_a_fresh_alert_shows_during_recovery_and_falls_back_to_fault() -> None:
+    logic = SignalLogic(recover_frames=50, hold_alert_s=1.0)
+    assert logic.step(0.0, State.ALERT).name == "ALERT"
+    assert logic.step(1.0, State.WARNING).name == "FAULT"
+
+
+def test_a_fresh_alert_shows_beside_a_fault_but_is_no_good_frame() -> None:
+    logic = SignalLogic(recover_frames=1, hold_alert_s=0.5)
+    assert logic.step(0.0, State.ALERT, CAMERA).name == "ALERT"
+    assert logic.step(0.6, None).name == "FAULT"
+
+
+@given(
+    steps=st.lists(
+        st.tuples(
+            st.floats(0, 0.4),
+            st.none() | st.sampled_from(State),
+            st.booleans(),
+        ),
+        max_size=60,
+    ),
+    hold_s=st.floats(0, 2),
+    recover=st.integers(1, 6),
+)
+@settings(deadline=None)
+def test_reassuring_colours_need_fresh_evidence(
+    steps: list[tuple[float, State | None, bool]], hold_s: float, recover: int
+) -> None:
+    logic = SignalLogic(hold_alert_s=hold_s, recover_frames=recover)
+    now_s, good = 0.0, 0
+    for pause_s, state, faulty in steps:
+        now_s += pause_s
+        signal = logic.step(now_s, state, CAMERA if faulty else ())
+        good = 0 if faulty else good + (state is not None)
+        if signal.name in ("IDLE", "SAFE", "WARNING"):
+            assert not faulty
+            assert good >= recover
+            assert signal.blink_hz == 0
+        if signal.name == "FAULT":
+            assert (signal.colour, signal.sound) == (Colour.ORANGE, Sound.NONE)
+            assert signal.blink_hz > 0
+            assert signal.faults
+        if state is State.ALERT:
+            assert signal.name == "ALERT"
+
+
+@pytest.mark.parametrize("blink_hz", [0.0, -1.0, math.nan])
+def test_fault_and_alert_refuse_to_be_steady(blink_hz: float) -> None:
+    with pytest.raises(ValueError, match="must blink"):
+        fault_signal((), blink_hz)
+    with pytest.raises(ValueError, match="must blink"):
+        SignalLogic(blink_hz=blink_hz)
+
+
+def test_assess_is_silent_when_all_is_fresh() -> None:
+    size = (3840, 2160)
+    assert assess(10, 9.6, 9.5, 0.5, 0.5, frame_size=size, table_size=size) == ()
+
+
+@pytest.mark.parametrize(
+    ("frame_s", "answer_s", "expected"),
+    [
+        (None, None, ("camera: no frame yet", "detector: no answer yet")),
+        (9.4, 10.0, ("camera: no frame for more than 0.5 s",)),
+        (10.0, 9.4, ("detector: no answer for more than 0.5 s",)),
+        (math.nan, 10.0, ("camera: no frame for more than 0.5 s",)),
+        (
+            99.0,
+            10.0,
+            ("camera: no frame with a usable time: the newest lies in the future",),
+        ),
+    ],
+)
+def test_assess_names_what_is_missing(
+    frame_s: float | None, answer_s: float | None, expected: tuple[str, ...]
+) -> None:
+    assert assess(10.0, frame_s, answer_s, 0.5, 0.5) == expected
+
+
+def test_assess_compares_table_and_frame_and_passes_explicit_faults_on() -> None:
+    faults = assess(
+        1, 1, 1, 0.5, 0.5, frame_size=(1920, 1080), table_size=(3840, 2160), explicit=("disk: x",)
+    )
+    assert faults == (
+        "geometry: the ground table is for 3840x2160 pixels, the frame has 1920x1080",
+        "disk: x",
+    )
+
+
+def test_fault_texts_stay_the_same_while_the_fault_lasts() -> None:
+    texts = {assess(10.0 + age, 9.0, 9.0, 0.5, 0.5) for age in range(5)}
+    assert len(texts) == 1
+
+
+def test_every_pair_of_states_follows_at_once_outside_alert() -> None:
+    calm = [State.IDLE, State.SAFE, State.WARNING]
+    for first, second in itertools.permutations(calm, 2):
+        logic, now_s = recovered()
+        logic.step(now_s, first)
+        assert logic.step(now_s + FRAME_S, second).name == second.name
