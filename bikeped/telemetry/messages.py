@@ -1,8 +1,7 @@
-"""Every MQTT payload and every event line: their shape, and how they are built. Pure.
+"""Builds every MQTT payload and every event line (their shapes are in `shapes`). Pure.
 
-Key names are those that programs outside rely on. Positions are metres in the camera ground frame
-(x forward, y right), rounded to a millimetre, so that files read well and two replays of one
-recording agree byte for byte. Only `latency_ms` and `started_at` differ between two runs; they come
+Positions are rounded to a millimetre, so that files read well and two replays of one recording
+agree byte for byte. Only `latency_ms` and `started_at` differ between two runs; they come
 last in their line, and `decision_view` leaves them out.
 """
 
@@ -12,33 +11,64 @@ import datetime as dt
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from msgspec import Meta
 
 from bikeped.errors import TelemetryError
+from bikeped.telemetry.shapes import (
+    Availability,
+    CameraHealth,
+    Counters,
+    EventDetection,
+    EventHeader,
+    EventLine,
+    EventTrack,
+    HealthMessage,
+    KindLabel,
+    Part,
+    Position,
+    ShownState,
+    StageLatency,
+    StateMessage,
+    TrackedObject,
+    TracksMessage,
+    Velocity,
+)
 from bikeped.types import Decision, Detections, FloatArray, Kind, State, Tracks
 
-ShownState = Literal["IDLE", "SAFE", "WARNING", "ALERT", "FAULT", "OFF"]
-KindLabel = Literal["pedestrian", "cyclist", "vehicle"]
-Availability = Annotated[
-    Literal["online", "offline"],
-    Meta(description="plain text, not JSON: online while connected, offline at the end or as will"),
+__all__ = [
+    "VOLATILE_KEYS",
+    "Availability",
+    "CameraHealth",
+    "Counters",
+    "EventDetection",
+    "EventHeader",
+    "EventLine",
+    "EventTrack",
+    "HealthMessage",
+    "Part",
+    "Position",
+    "ShownState",
+    "StageLatency",
+    "StateMessage",
+    "TrackedObject",
+    "TracksMessage",
+    "Velocity",
+    "decision_digest",
+    "decision_view",
+    "encode",
+    "encode_line",
+    "event_header",
+    "event_line",
+    "health_message",
+    "parse_event",
+    "rfc3339",
+    "state_message",
+    "tracks_message",
 ]
-Timestamp = Annotated[
-    str,
-    Meta(
-        pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z$",
-        description="RFC 3339, UTC, to the millisecond",
-        extra_json_schema={"format": "date-time"},
-    ),
-]
-Point = Annotated[tuple[float, float], Meta(description="x forward, y right, metres")]
-Pair = Annotated[tuple[int, int], Meta(description="track ids: cyclist, pedestrian")]
-Count = Annotated[int, Meta(ge=0)]
 
 VOLATILE_KEYS = ("latency_ms", "started_at")  #: the only keys that differ between two replays
 
@@ -53,155 +83,6 @@ _STATES: dict[State, ShownState] = {
     State.WARNING: "WARNING",
     State.ALERT: "ALERT",
 }
-
-# No field of a message has a default, so every key is always there.
-
-
-class Position(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an object is."""
-
-    x: Annotated[float, Meta(description="forward of the camera, metres")]
-    y: Annotated[float, Meta(description="right of the camera, metres")]
-    distance: Annotated[float, Meta(ge=0, description="from the point below the lens, metres")]
-
-
-class Velocity(msgspec.Struct, frozen=True, kw_only=True):
-    """How an object moves."""
-
-    x: Annotated[float, Meta(description="metres per second")]
-    y: Annotated[float, Meta(description="metres per second")]
-    speed: Annotated[float, Meta(ge=0, description="metres per second")]
-
-
-class TrackedObject(msgspec.Struct, frozen=True, kw_only=True):
-    """One object of the tracks message."""
-
-    track_id: int
-    class_: KindLabel = msgspec.field(name="class")
-    position: Position
-    velocity: Velocity
-    history: Annotated[list[Point], Meta(description="recent positions, oldest first")]
-
-
-class TracksMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """`bikeped/<site>/tracks`, at the publish interval, not retained."""
-
-    timestamp: Timestamp
-    frame_number: Count
-    state: ShownState
-    objects: list[TrackedObject]
-
-
-class StateMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """`bikeped/<site>/state`, at every change, retained: what the light shows."""
-
-    state: ShownState
-    since: Timestamp
-    pair: Pair | None
-    distance_m: Annotated[float, Meta(ge=0)] | None
-    config_hash: str
-    sentence: Annotated[str, Meta(description="why, in one line for a resident")]
-
-
-class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
-    """Percentiles of one stage over the last frames, milliseconds."""
-
-    p50: float
-    p95: float
-    p99: float
-    max: float
-
-
-class Part(msgspec.Struct, frozen=True, kw_only=True):
-    """One part of the system: does it work, and one line about it."""
-
-    ok: bool
-    detail: str
-
-
-class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The camera."""
-
-    ok: bool
-    detail: str
-    capture_age_ms: Annotated[
-        float | None, Meta(description="age of the newest frame; null before the first")
-    ]
-
-
-class Counters(msgspec.Struct, frozen=True, kw_only=True):
-    """Totals since the process started."""
-
-    frames: Count
-    dropped: Annotated[Count, Meta(description="frames replaced by a newer one before inference")]
-    undecodable: Annotated[Count, Meta(description="frames whose picture could not be decoded")]
-    alerts: Annotated[Count, Meta(description="changes into ALERT")]
-    mqtt_dropped: Annotated[Count, Meta(description="messages dropped before reaching the broker")]
-    audit_dropped: Annotated[Count, Meta(description="event lines not written to the audit log")]
-
-
-class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """`bikeped/<site>/health`, every 10 s by default, retained."""
-
-    timestamp: Timestamp
-    state: ShownState
-    version: str
-    config_hash: str
-    uptime_s: Annotated[float, Meta(ge=0)]
-    fps: Annotated[float, Meta(ge=0)]
-    latency_ms: Annotated[dict[str, StageLatency], Meta(description="by stage")]
-    camera: CameraHealth
-    detector: Part
-    light: Part
-    faults: Annotated[list[str], Meta(description="what is wrong, one line each; empty: nothing")]
-    counters: Counters
-
-
-class EventHeader(msgspec.Struct, frozen=True, kw_only=True):
-    """First line of an event file; in an audit log also the first line of every later run."""
-
-    format: Literal["bikeped-events/1"]
-    config_hash: str
-    calibration_hash: str | None
-    model_hash: str | None
-    version: str
-    started_at: Timestamp
-
-
-class EventTrack(msgspec.Struct, frozen=True, kw_only=True):
-    """One track of an event line."""
-
-    id: int
-    kind: KindLabel
-    x: Annotated[float, Meta(description="metres")]
-    y: Annotated[float, Meta(description="metres")]
-    vx: Annotated[float, Meta(description="metres per second")]
-    vy: Annotated[float, Meta(description="metres per second")]
-    lost: Annotated[bool, Meta(description="not seen in this frame: the position is predicted")]
-
-
-class EventDetection(msgspec.Struct, frozen=True, kw_only=True):
-    """One detection of an event line."""
-
-    kind: KindLabel
-    confidence: Annotated[float, Meta(ge=0, le=1)]
-    box: Annotated[
-        tuple[float, float, float, float], Meta(description="u1, v1, u2, v2 in sensor pixels")
-    ]
-
-
-class EventLine(msgspec.Struct, frozen=True, kw_only=True):
-    """One frame of an event file or of the audit log."""
-
-    t: Annotated[float, Meta(description="seconds from the start")]
-    frame: Count
-    state: ShownState
-    pair: Pair | None
-    tracks: list[EventTrack]
-    detections: list[EventDetection]
-    sentence: str
-    latency_ms: Annotated[dict[str, float], Meta(description="by stage")]
-
 
 _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder()
@@ -357,20 +238,20 @@ def event_line(
     tracks: Tracks,
     detections: Detections,
     latency_ms: Mapping[str, float],
-    shown: ShownState | None = None,
-    sentence: str | None = None,
+    light: ShownState | None = None,
 ) -> EventLine:
     """The event line of one frame, `t_s` seconds after the start.
 
-    `shown` and `sentence` replace the decision's own where the light says something else (FAULT).
-    Tracks without finite numbers are left out, as in `tracks_message`.
+    `light` is what the light showed, None where that is what was decided. Tracks without finite
+    numbers are left out, as in `tracks_message`.
     """
     keep = _finite(tracks)
     pair = decision.pair
     return EventLine(
         t=_number(t_s, 4) or 0.0,
         frame=frame,
-        state=shown or _STATES[decision.state],
+        state=_STATES[decision.state],
+        light=light or _STATES[decision.state],
         pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
         tracks=[
             EventTrack(id=track_id, kind=_LABELS[kind], x=x, y=y, vx=vx, vy=vy, lost=lost)
@@ -392,7 +273,7 @@ def event_line(
                 strict=True,
             )
         ],
-        sentence=decision.sentence if sentence is None else sentence,
+        sentence=decision.sentence,
         latency_ms={stage: _number(ms, 3) or 0.0 for stage, ms in latency_ms.items()},
     )
 

@@ -13,18 +13,18 @@ from typing import Any
 import msgspec
 
 from bikeped.errors import TelemetryError
-from bikeped.telemetry import messages
+from bikeped.telemetry import shapes
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 #: file name (before .schema.json) -> type of the payload
 MESSAGES: dict[str, Any] = {
-    "tracks": messages.TracksMessage,
-    "state": messages.StateMessage,
-    "health": messages.HealthMessage,
-    "availability": messages.Availability,
-    "event-header": messages.EventHeader,
-    "event-frame": messages.EventLine,
+    "tracks": shapes.TracksMessage,
+    "state": shapes.StateMessage,
+    "health": shapes.HealthMessage,
+    "availability": shapes.Availability,
+    "event-header": shapes.EventHeader,
+    "event-frame": shapes.EventLine,
 }
 
 

@@ -200,7 +200,7 @@ def test_health_message_keys_and_rounding():
 def test_event_line_exactly_and_in_order():
     line = m.encode_line(event_line())
     assert line == (
-        b'{"t":1.2346,"frame":42,"state":"ALERT","pair":[7,3],"tracks":['
+        b'{"t":1.2346,"frame":42,"state":"ALERT","light":"ALERT","pair":[7,3],"tracks":['
         b'{"id":3,"kind":"pedestrian","x":3.0,"y":4.0,"vx":0.0,"vy":0.0,"lost":true},'
         b'{"id":7,"kind":"cyclist","x":0.0,"y":12.346,"vx":3.0,"vy":-4.0,"lost":false}],'
         b'"detections":[{"kind":"cyclist","confidence":0.1,"box":[1.0,2.1,3.0,4.0]}],'
@@ -208,6 +208,11 @@ def test_event_line_exactly_and_in_order():
         b'"latency_ms":{"pre":1.235,"total":20.0}}\n'
     )
     assert m.parse_event(line) == event_line()
+
+
+def test_the_light_of_an_event_line_may_differ_from_the_decision():
+    line = event_line(light="FAULT")
+    assert (line.state, line.light, line.pair) == ("ALERT", "FAULT", (7, 3))
 
 
 def test_event_header_and_the_keys_that_interfaces_promise():
