@@ -114,8 +114,6 @@ class SignalLogic:
             self._recovered = False
             self._good_frames = 0
             self._why = faults
-            # What was decided before the fault is old news once it is over.
-            self._state = None
         elif state is not None:
             self._state = state
             self._good_frames = min(self._good_frames + 1, self._recover_frames)

@@ -1,0 +1,54 @@
+"""docs/install-on-a-pole.md: keys, commands and messages on it exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from bikeped.config.sections import Config
+from bikeped.feedback.light import DEADMAN
+from bikeped.feedback.signal import assess
+
+PAGE = (Path(__file__).parents[2] / "docs" / "install-on-a-pole.md").read_text()
+KEYS = sorted(
+    set(re.findall(r"`((?:camera|detection|feedback|mqtt|audit)(?:\.[a-z]\w*)+)(?:: \w+)?`", PAGE))
+)
+COMMANDS = {"run", "replay", "demo", "config", "doctor", "calibrate", "conformance", "model"}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_key_exists(key: str) -> None:
+    section = Config
+    for part in key.split("."):
+        section = {field.name: field.type for field in msgspec.structs.fields(section)}[part]
+
+
+def test_the_example_is_a_configuration() -> None:
+    (example,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    config = msgspec.yaml.decode(example, type=Config)
+    assert config.feedback.light == "gpio"
+
+
+def test_only_commands_of_the_interface_are_used() -> None:
+    pieces = re.findall(r"```sh\n(.*?)```|`([^`\n]+)`", PAGE, re.DOTALL)
+    code = "\n".join(block + inline for block, inline in pieces)
+    used = set(re.findall(r"(?:^|bin/|sudo )bikeped ([a-z]+)", code, re.MULTILINE))
+    assert used
+    assert used <= COMMANDS
+
+
+def test_the_fault_table_has_the_texts_that_the_code_writes() -> None:
+    faults = [
+        *assess(0, None, None, 1, 1),
+        *assess(9, 0, 0, 1, 1, frame_size=(1, 1), table_size=(2, 2)),
+        DEADMAN,
+    ]
+    listed = [
+        text.removesuffix("...").strip()
+        for text in re.findall(r"^\| `([^`]+)` \|", PAGE, re.MULTILINE)
+    ]
+    for fault in faults:
+        assert any(fault.startswith(text) for text in listed), fault
