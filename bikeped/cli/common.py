@@ -1,0 +1,104 @@
+"""What every command shares: options, errors on one line, JSON output, progress."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bikeped.errors import BikepedError
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def config_options(command: F) -> F:
+    """`-c` and `--set`, here and on every command that reads a configuration."""
+    command = click.option(
+        "--set",
+        "overrides",
+        multiple=True,
+        metavar="SECTION.KEY=VALUE",
+        help="Override one key of the configuration; may be repeated.",
+    )(command)
+    return click.option(
+        "-c",
+        "--config",
+        "config_path",
+        type=click.Path(path_type=Path),
+        help="Configuration file; default: ./config.yaml, or the bundled one.",
+    )(command)
+
+
+def json_option(command: F) -> F:
+    """`--json FILE`, `-` for standard output."""
+    return click.option(
+        "--json",
+        "json_path",
+        metavar="FILE",
+        help="Write machine-readable JSON; - for standard output, and nothing else there.",
+    )(command)
+
+
+def write_json(data: Any, target: str) -> None:
+    """Writes JSON to a file (whole or not at all) or to standard output."""
+    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+    if target == "-":
+        sys.stdout.write(text)
+        return
+    write_whole(Path(target), text)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes a file under a temporary name and renames it."""
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent or Path())
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            Path(name).chmod(0o644)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise BikepedError(
+            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and that "
+            "you may write"
+        ) from error
+
+
+def console(json_path: str | None = None) -> Console:
+    """Where tables for people go: standard output, unless JSON goes there."""
+    return Console(stderr=json_path == "-", highlight=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def progress_bar(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """A progress bar on standard error when that is a terminal; calls take the count so far."""
+    screen = Console(stderr=True)
+    if not screen.is_terminal:
+        yield lambda done: None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=screen, transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def set_up_logging(level: str) -> None:
+    """Log lines on standard error; under systemd the journal adds the time itself."""
+    form = "%(levelname)s %(name)s: %(message)s"
+    if "JOURNAL_STREAM" not in os.environ:
+        form = "%(asctime)s " + form
+    logging.basicConfig(level=level.upper(), format=form, stream=sys.stderr)
+    logging.getLogger("asyncio").setLevel(logging.WARNING)

@@ -1,0 +1,88 @@
+"""`bikeped config`: check, show, schema."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+import msgspec
+
+from bikeped.cli.common import config_options, json_option, write_json
+from bikeped.config import Config, framing, ground_camera, load_config
+from bikeped.errors import ConfigError
+from bikeped.geometry import GroundTable
+
+
+@click.group("config")
+def command() -> None:
+    """Check, show or describe the configuration."""
+
+
+@command.command("check")
+@config_options
+@json_option
+def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
+    """Say what is wrong with the configuration, or that all is well."""
+    from bikeped.feedback import check_light
+
+    loaded = load_config(config_path, overrides)
+    frame = framing(loaded)
+    camera = ground_camera(loaded)
+    GroundTable(camera, *frame.crop_wh, step_px=64)
+    check_light(loaded.config.feedback)
+    model = loaded.config.detection.model
+    if model is not None and not loaded.path(model).is_file():
+        raise ConfigError(
+            f"{loaded.source}: detection.model: {loaded.path(model)} does not exist; correct the "
+            "path or export the model there"
+        )
+    report = {
+        "ok": True,
+        "source": loaded.source,
+        "config_hash": loaded.hash,
+        "calibration_hash": loaded.calibration_hash,
+        "focal_length_px": camera.lens.focal_px,
+        "model": None if model is None else str(loaded.path(model)),
+    }
+    if json_path is not None:
+        write_json(report, json_path)
+    if json_path != "-":
+        click.echo(f"{loaded.source}: good; configuration {loaded.hash[:12]}")
+        click.echo(
+            f"lens {camera.lens.projection}, f = {camera.lens.focal_px:.2f} px, "
+            f"height {camera.height_m:g} m, pitch {camera.pitch_deg:g} degrees"
+        )
+        if model is None:
+            click.echo("detection.model is not set: `bikeped run` needs one")
+
+
+@command.command("show")
+@config_options
+@json_option
+def show(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
+    """Show the whole effective configuration as YAML."""
+    loaded = load_config(config_path, overrides)
+    if json_path is not None:
+        write_json(msgspec.to_builtins(loaded.config), json_path)
+    if json_path != "-":
+        click.echo(f"# {loaded.source}, configuration {loaded.hash}")
+        click.echo(msgspec.yaml.encode(loaded.config).decode(), nl=False)
+
+
+@command.command("schema")
+@config_options
+@json_option
+def schema(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
+    """Show the JSON Schema of the configuration."""
+    data = json_schema()
+    if json_path is not None and json_path != "-":
+        write_json(data, json_path)
+    else:
+        click.echo(json.dumps(data, indent=2))
+
+
+def json_schema() -> dict[str, object]:
+    """The JSON Schema of config.yaml."""
+    data = msgspec.json.schema(Config)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **data}

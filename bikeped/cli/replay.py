@@ -1,0 +1,105 @@
+"""`bikeped replay`: a recorded video through the very same loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
+from bikeped.config import load_config
+from bikeped.errors import BikepedError
+
+if TYPE_CHECKING:
+    from bikeped.service.run import ReplayResult
+
+
+@click.command("replay")
+@click.argument("video")
+@config_options
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for overlay.mp4, events.jsonl and summary.json.",
+)
+@click.option("--overlay", type=click.Path(path_type=Path), help="Overlay video, .mp4.")
+@click.option("--events", type=click.Path(path_type=Path), help="Event file, JSON Lines.")
+@click.option("--no-mqtt", is_flag=True, help="Publish nothing, whatever the configuration says.")
+@click.option("--realtime", is_flag=True, help="At the recording's own pace.")
+@json_option
+def command(
+    video: str,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    out: Path | None,
+    overlay: Path | None,
+    events: Path | None,
+    no_mqtt: bool,
+    realtime: bool,
+    json_path: str | None,
+) -> None:
+    """Run VIDEO (a file or a folder of pictures) through the loop and say what it decided."""
+    from bikeped.service.run import ReplayFiles, replay
+
+    loaded = load_config(config_path, overrides)
+    if out is not None:
+        make_folder(out)
+        overlay = overlay or out / "overlay.mp4"
+        events = events or out / "events.jsonl"
+    with progress_bar("replay", None) as progress:
+        result = replay(
+            loaded,
+            video,
+            files=ReplayFiles(events, overlay),
+            realtime=realtime,
+            mqtt=not no_mqtt,
+            progress=progress,
+        )
+    summary = result.as_dict()
+    if out is not None:
+        write_json(summary, str(out / "summary.json"))
+    if json_path is not None:
+        write_json(summary, json_path)
+    if json_path != "-":
+        print_result(console(), result)
+        for path in (overlay, events):
+            if path is not None:
+                click.echo(f"wrote {path}")
+
+
+def make_folder(folder: Path) -> None:
+    """Makes an output folder; BikepedError when that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BikepedError(
+            f"{folder}: cannot be made ({error.strerror}); choose another --out"
+        ) from error
+
+
+def print_result(screen: Console, result: ReplayResult) -> None:
+    """The summary for people."""
+    data = result.as_dict()
+    screen.print(
+        f"{data['frames']} frames, {data['duration_s']:.1f} s of recording, "
+        f"{data['frames_per_second']:.1f} frames/s; detector: {data['detector']}"
+    )
+    if data["undecodable"]:
+        screen.print(f"{data['undecodable']} frames did not decode and were skipped")
+    found = ", ".join(f"{count} {kind}" for kind, count in data["tracks"].items()) or "none"
+    screen.print(f"tracks: {found}")
+    total = max(1, sum(data["states"].values()))
+    shares = ", ".join(f"{s} {n / total:.0%}" for s, n in data["states"].items())
+    screen.print(f"states: {shares}")
+    for alert in data["alerts"]:
+        screen.print(f"  {alert['t']:7.2f} s  {alert['sentence']} ({alert['frames']} frames)")
+    table = Table(title="latency, ms", title_justify="left", box=None, pad_edge=False)
+    table.add_column("stage")
+    for name in ("mean", "p50", "p95", "p99", "max"):
+        table.add_column(name, justify="right")
+    for stage, row in data["latency_ms"].items():
+        table.add_row(stage, *(f"{row[n]:.2f}" for n in ("mean", "p50", "p95", "p99", "max")))
+    screen.print(table)

@@ -1,0 +1,116 @@
+"""Where frames come from, live or recorded, behind one call: the next frame, please."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
+
+from bikeped.capture import FrameGrabber, FrameSource
+from bikeped.types import Frame
+
+
+class Feed(Protocol):
+    """A source of frames for the loop."""
+
+    live: bool
+
+    async def next(self) -> tuple[Frame, float] | None:
+        """The next frame and how long getting it took in ms; None at the end of a recording."""
+
+    def newest_s(self, now_s: float) -> float | None:
+        """When the newest frame arrived, on the loop's clock; None before the first."""
+
+    def dropped(self) -> int:
+        """Frames that were replaced by a newer one before anybody took them."""
+
+    def hung_s(self, now_s: float) -> float:
+        """How long a read has not returned."""
+
+    def error(self) -> str | None:
+        """What is wrong with the source now, in one line."""
+
+    async def close(self) -> None: ...
+
+
+class LiveFeed:
+    """The newest frame of a camera; old ones are dropped and counted."""
+
+    live = True
+
+    def __init__(self, grabber: FrameGrabber) -> None:
+        self._grabber = grabber
+
+    async def next(self) -> tuple[Frame, float] | None:
+        while True:
+            frame = await self._grabber.next(1.0)
+            if frame is not None:
+                return frame, max(0.0, (time.monotonic() - frame.captured_s) * 1e3)
+            if self._grabber.ended:
+                return None
+
+    def newest_s(self, now_s: float) -> float | None:
+        age_s = self._grabber.age_s(now_s)
+        return now_s - age_s if math.isfinite(age_s) else None
+
+    def dropped(self) -> int:
+        return self._grabber.dropped
+
+    def hung_s(self, now_s: float) -> float:
+        return self._grabber.hung_s(now_s)
+
+    def error(self) -> str | None:
+        error = self._grabber.error
+        return None if error is None else str(error)
+
+    async def close(self) -> None:
+        await asyncio.to_thread(self._grabber.stop)
+
+
+class RecordedFeed:
+    """Every frame of a recording in order, read one ahead in a thread of its own."""
+
+    live = False
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="read")
+        self._ahead: asyncio.Future[tuple[Frame | None, float]] | None = None
+
+    async def next(self) -> tuple[Frame, float] | None:
+        loop = asyncio.get_running_loop()
+        if self._ahead is None:
+            self._ahead = loop.run_in_executor(self._pool, _timed, self._source.read)
+        frame, took_ms = await self._ahead
+        if frame is None:
+            return None
+        self._ahead = loop.run_in_executor(self._pool, _timed, self._source.read)
+        return frame, took_ms
+
+    def newest_s(self, now_s: float) -> float | None:
+        return None
+
+    def dropped(self) -> int:
+        return 0
+
+    def hung_s(self, now_s: float) -> float:
+        return 0.0
+
+    def error(self) -> str | None:
+        return None
+
+    async def close(self) -> None:
+        if self._ahead is not None:
+            self._ahead.cancel()
+            await asyncio.wait([self._ahead])
+        await asyncio.get_running_loop().run_in_executor(self._pool, self._source.close)
+        self._pool.shutdown()
+
+
+def _timed(read: Callable[[], Frame | None]) -> tuple[Frame | None, float]:
+    began = time.perf_counter()
+    frame = read()
+    return frame, (time.perf_counter() - began) * 1e3

@@ -1,0 +1,112 @@
+"""From detections to a decision: ground, track, predict, decide.
+
+The pole, a replay and the pixel simulation all run this class; it has no clock and no I/O.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from bikeped.config import (
+    LoadedConfig,
+    framing,
+    ground_camera,
+    rule_settings,
+    tracker_settings,
+)
+from bikeped.decision import Decider
+from bikeped.geometry import Framing, GroundTable
+from bikeped.tracking import Tracker, predict
+from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What one frame led to; `track_ms` and `decide_ms` are how long that took."""
+
+    points: GroundPoints
+    tracks: Tracks
+    decision: Decision
+    track_ms: float
+    decide_ms: float
+
+
+class Judge:
+    """Judges frames in order of their capture times."""
+
+    def __init__(self, loaded: LoadedConfig) -> None:
+        config = loaded.config
+        fps = config.decision.nominal_fps
+        self.sensor_framing = framing(loaded)
+        self.camera = ground_camera(loaded)
+        self.table = GroundTable(
+            self.camera, *self.sensor_framing.crop_wh, step_px=config.camera.table_step_px
+        )
+        self._tracker_settings = tracker_settings(config.tracking, fps)
+        self._speed_window_s = config.tracking.speed_window_frames / fps
+        self._history = config.tracking.history_frames
+        self._max_range_m = config.tracking.max_range_m
+        self._rule = rule_settings(config.decision)
+        self._latency = config.latency
+        self._fixed_ahead_s = config.latency.frames / fps
+        self._framings: dict[tuple[int, int], Framing] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets all tracks and memories, as when a recording starts anew."""
+        self.tracker = Tracker(self._tracker_settings, self._speed_window_s, self._history)
+        self._decider = Decider(self._rule)
+        self._last_s = -math.inf
+
+    def framing_of(self, width: int, height: int) -> Framing:
+        """The framing of frames of this size; GeometryError when they are another camera's."""
+        known = self._framings.get((width, height))
+        if known is None:
+            known = self.sensor_framing.for_frame(width, height)
+            self._framings = {(width, height): known}
+        return known
+
+    def ground(self, detections: Detections, frame: Framing) -> GroundPoints:
+        """Detections on the ground; those above the horizon or out of range are left out."""
+        crop = frame.frame_to_crop(detections.bottom_centre_px())
+        xy, valid = self.table.lookup(crop)
+        near = valid & (np.nan_to_num(np.hypot(xy[:, 0], xy[:, 1]), nan=np.inf) < self._max_range_m)
+        index = np.nonzero(near)[0]
+        return GroundPoints(detections.kind[index], xy[index], index.astype(np.int64))
+
+    def judge(
+        self, detections: Detections, width: int, height: int, captured_s: float, age_s: float
+    ) -> Judgement:
+        """The judgement of a frame of `width` x `height` captured at `captured_s`.
+
+        `age_s` is how old the frame is now; the latency section says what is made of it. Capture
+        times must increase: a frame that is not newer than the last one is a ValueError.
+        """
+        began = time.perf_counter()
+        if captured_s <= self._last_s:
+            raise ValueError(f"captured_s: {captured_s} is not after {self._last_s}")
+        self._last_s = captured_s
+        points = self.ground(detections, self.framing_of(width, height))
+        tracks = self.tracker.update(points, captured_s)
+        tracked = time.perf_counter()
+        decision = self._decider.step(
+            captured_s, tracks.id, tracks.kind, self._ahead(tracks, age_s)
+        )
+        decided = time.perf_counter()
+        return Judgement(
+            points, tracks, decision, (tracked - began) * 1e3, (decided - tracked) * 1e3
+        )
+
+    def _ahead(self, tracks: Tracks, age_s: float) -> FloatArray:
+        """Positions where the tracks are by now, as far as the configuration asks for it."""
+        latency = self._latency
+        if latency.compensation == "off":
+            return tracks.xy_m
+        ahead_s = self._fixed_ahead_s if latency.compensation == "frames" else age_s
+        ahead_s = min(max(ahead_s + latency.camera_offset_s, 0.0), latency.max_s)
+        velocity, acceleration = self.tracker.smoothed()
+        return predict(tracks.xy_m, velocity, acceleration, ahead_s, latency.order)

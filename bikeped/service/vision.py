@@ -1,0 +1,76 @@
+"""From a frame to detections: decoding, and whatever looks at the picture."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+from bikeped.capture.jpeg import JpegDecoder
+from bikeped.detection.base import Detector, DetectorAnswer
+from bikeped.types import Frame, ImageArray
+
+#: Pictures in use at once: one being decoded, one waiting, one looked at, one being drawn.
+PICTURES = 5
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded frame; `rgb` may be a scaled copy and is valid for the next `PICTURES` - 1."""
+
+    frame: Frame
+    rgb: ImageArray
+    received_s: float  #: time.perf_counter() when the frame was taken over
+    acquire_ms: float
+    decode_ms: float
+
+
+class Eye(Protocol):
+    """What looks at pictures: a model, or the demo's reader of drawn boxes."""
+
+    name: str
+    model_hash: str | None
+
+    def decode_size(self, width: int, height: int) -> tuple[int, int]:
+        """Least picture size that it needs of a frame of this size."""
+
+    def see(self, picture: Picture) -> DetectorAnswer:
+        """What is in the picture; raises DetectorError. Called in one worker thread."""
+
+
+class ModelEye:
+    """A detector model."""
+
+    def __init__(self, detector: Detector) -> None:
+        self._detector = detector
+        self.name = detector.name
+        self.model_hash: str | None = detector.model_hash
+
+    def decode_size(self, width: int, height: int) -> tuple[int, int]:
+        return self._detector.decode_size(width, height)
+
+    def see(self, picture: Picture) -> DetectorAnswer:
+        return self._detector.infer(picture.rgb, picture.frame.width, picture.frame.height)
+
+
+class Decoder:
+    """Decodes frames at the smallest scale that the eye (and a picture for people) needs."""
+
+    def __init__(self, eye: Eye, view_width: int = 0) -> None:
+        self._eye = eye
+        self._view_width = view_width
+        self._jpeg = JpegDecoder(buffers=PICTURES)
+
+    def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> Picture:
+        """The picture of a frame; raises CaptureError when it does not decode."""
+        began = time.perf_counter()
+        if frame.rgb is not None:
+            rgb = frame.rgb
+        else:
+            assert frame.jpeg is not None  # noqa: S101  Frame holds one of the two
+            width, height = self._eye.decode_size(frame.width, frame.height)
+            view = min(self._view_width, frame.width)
+            if view > width:
+                width, height = view, max(height, round(frame.height * view / frame.width))
+            rgb = self._jpeg.decode(frame.jpeg, min_width=width, min_height=height)
+        return Picture(frame, rgb, received_s, acquire_ms, (time.perf_counter() - began) * 1e3)
