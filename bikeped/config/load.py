@@ -19,6 +19,17 @@ from bikeped.errors import ConfigError
 
 _MAX_BYTES = 1_000_000
 _MAX_NODES = 100_000
+#: What PyYAML raises beside YAMLError, on odd numbers, dates and explicit tags (`!!int ''`).
+_YAML_TROUBLE = (
+    ValueError,
+    OverflowError,
+    RecursionError,
+    TypeError,
+    LookupError,
+    AttributeError,
+)
+#: Halves of surrogate pairs, which no UTF-8 text holds, and NUL, which no path holds.
+_UNUSABLE = re.compile("[\ud800-\udfff\0]")
 
 
 @dataclass(frozen=True)
@@ -38,7 +49,7 @@ class LoadedConfig:
 
     def path(self, relative: str) -> Path:
         """A path of the configuration, resolved against the folder of its file."""
-        return (self.base_dir / Path(relative).expanduser()).absolute()
+        return (self.base_dir / _expanded(relative)).absolute()
 
 
 def default_config_path() -> Path:
@@ -88,7 +99,7 @@ def parse_config(
     _cross_check(config, where)
     calibration, calibration_hash = None, None
     if config.camera.calibration is not None:
-        file = base_dir / Path(config.camera.calibration).expanduser()
+        file = base_dir / _expanded(config.camera.calibration)
         calibration, calibration_hash = load_calibration(file)
         _check_fit(config, calibration, str(file))
     return LoadedConfig(
@@ -110,8 +121,7 @@ def config_hash(config: Config, calibration_hash: str | None = None) -> str:
 
 def _yaml_mapping(text: str, source: str) -> dict[str, Any]:
     try:
-        _refuse_blow_up(text, source)
-        data = yaml.safe_load(text)
+        data = _load_yaml(text, source)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
@@ -119,8 +129,9 @@ def _yaml_mapping(text: str, source: str) -> dict[str, Any]:
         raise ConfigError(
             f"{source}{where}: is not YAML ({what}); check the indentation"
         ) from error
-    except (ValueError, OverflowError, RecursionError, TypeError) as error:
-        raise ConfigError(f"{source}: is not a usable YAML value ({error}); simplify it") from error
+    except _YAML_TROUBLE as error:
+        what = _one_line(str(error))
+        raise ConfigError(f"{source}: is not a usable YAML value ({what}); simplify it") from error
     if data is None:
         return {}
     if not isinstance(data, dict):
@@ -128,37 +139,63 @@ def _yaml_mapping(text: str, source: str) -> dict[str, Any]:
     return data
 
 
-def _refuse_blow_up(text: str, source: str) -> None:
-    """Refuses aliases: a few lines of them can stand for gigabytes, and nobody needs them here."""
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """PyYAML keeps the last of two equal keys; a section that is not heeded must not go unseen."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    problem=f"{_one_line(key.value)} stands twice", problem_mark=key.start_mark
+                )
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else key)
+        return super().construct_mapping(node, deep)
+
+
+def _load_yaml(text: str, source: str) -> Any:
+    """YAML without aliases (a few lines of them can stand for gigabytes), each key once."""
     for nodes, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
-        if isinstance(event, yaml.AliasEvent) or nodes > _MAX_NODES:
-            mark = event.start_mark
-            raise ConfigError(
-                f"{source}, line {mark.line + 1 if mark else '?'}: YAML aliases are not allowed; "
-                "write the value out"
-            )
+        mark = event.start_mark
+        where = f"{source}, line {mark.line + 1 if mark else '?'}"
+        if isinstance(event, yaml.AliasEvent):
+            raise ConfigError(f"{where}: YAML aliases are not allowed; write the value out")
+        if nodes > _MAX_NODES:
+            raise ConfigError(f"{where}: more values than a configuration has; shorten it")
+        if isinstance(event, yaml.ScalarEvent) and _UNUSABLE.search(event.value):
+            raise ConfigError(f"{where}: a character that no text can hold; take it out")
+    return yaml.load(text, Loader=_UniqueKeyLoader)
+
+
+def _expanded(path: str) -> Path:
+    """With `~` and `~user` replaced; an unknown user's stays, and is then not found."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
 
 
 def _apply(data: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
+    said = f"--set {_one_line(override)}"
     if not equals or len(parts) < 2 or not all(parts):
-        raise ConfigError(
-            f"--set {override}: expected SECTION.KEY=VALUE, e.g. --set decision.d_max_m=20"
-        )
+        raise ConfigError(f"{said}: expected SECTION.KEY=VALUE, e.g. --set decision.d_max_m=20")
+    if _UNUSABLE.search(key):
+        raise ConfigError(f"{said}: a character that no key holds; take it out")
     try:
-        value = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"--set {override}: the value is not YAML; quote it") from error
+        value = _load_yaml(text, said)
+    except (yaml.YAMLError, *_YAML_TROUBLE) as error:
+        raise ConfigError(f"{said}: the value is not YAML; quote it") from error
     if key.strip() in _PATH_KEYS and isinstance(value, str) and value:
-        value = str(Path(value).expanduser().absolute())
+        value = str(_expanded(value).absolute())
     node = data
     for part in parts[:-1]:
         child = node.get(part)
         if child is None:
             child = node[part] = {}
         if not isinstance(child, dict):
-            raise ConfigError(f"--set {override}: {part} is not a section")
+            raise ConfigError(f"{said}: {part} is not a section; name one with its key")
         node = child
     node[parts[-1]] = value
 
@@ -222,10 +259,11 @@ def _explain(error: msgspec.ValidationError, data: dict[str, Any]) -> str:
         key = _one_line(f"{section}.{name}" if section else name)
         return f"{key}: unknown key; {mend}"
     if path.startswith("key` in"):
-        return f"{_one_line(path[8:])}: a key is not text; keys are words such as camera"
+        section = path.removeprefix("key` in `$").removeprefix(".") or "top level"
+        return f"{_one_line(section)}: a key is not text; keys are words such as camera"
     key = path.removeprefix("$").removeprefix(".")
     value = _value_at(data, key)
-    got = f" (got {_one_line(repr(value))})" if value is not None else ""
+    got = f" (got {_shown(value)})" if value is not None else ""
     label = _one_line(key) or "top level"
     mend = _allowed(key) or "see bikeped config schema"
     return f"{label}: {_one_line(body[:1].lower() + body[1:])}{got}; {mend}"
@@ -235,15 +273,17 @@ def _allowed(key: str) -> str:
     """The values that a key takes, in words; empty where the schema has no short answer."""
     _, parts = msgspec.json.schema_components([Config], ref_template="{name}")
     node: dict[str, Any] = parts["Config"]
-    for name in key.split("."):
+    for name in key.partition("[")[0].split("."):
         item = node.get("properties", {}).get(name)
         if item is None:
             return ""
         reference = item.get("$ref") or next(
             (a["$ref"] for a in item.get("allOf", item.get("anyOf", ())) if "$ref" in a), None
         )
-        node = parts[reference] if reference in parts else item
+        node = parts.get(str(reference), item)
     choices = [node, *node.get("anyOf", ())]
+    if "[" in key and isinstance(node.get("items"), dict):
+        choices = [node["items"]]
     names = [str(n) for c in choices for n in c.get("enum", ()) if n is not None]
     if names:
         return f"use one of {', '.join(names)}"
@@ -259,6 +299,13 @@ def _allowed(key: str) -> str:
 def _one_line(text: str) -> str:
     flat = " ".join(text.split())
     return flat if len(flat) <= 80 else flat[:77] + "..."
+
+
+def _shown(value: object) -> str:
+    try:
+        return _one_line(repr(value))
+    except ValueError:  # a whole number of thousands of digits
+        return "a huge number"
 
 
 def _value_at(data: Any, key: str) -> Any:

@@ -17,6 +17,7 @@ Metres = Annotated[float, Meta(ge=0, le=1000)]
 Seconds = Annotated[float, Meta(ge=0, le=3600)]
 Ratio = Annotated[float, Meta(ge=0, le=1)]
 Radial = Annotated[float, Meta(ge=-10, le=10)]
+Line = Annotated[str, Meta(min_length=1)] | Annotated[int, Meta(ge=0, le=4095)]
 Projection = Literal[
     "equidistant",
     "equisolid",
@@ -259,9 +260,10 @@ class TrackingConfig(_Section, frozen=True):
         Meta(
             gt=0,
             le=1,
-            description="weight of the newest step in the smoothed velocity, per nominal frame",
+            description="weight of the newest step in the smoothed velocity, per nominal frame; the "
+            "paper's simulation has 0.5, with which the noise of real boxes throws lost tracks far",
         ),
-    ] = 0.5
+    ] = 0.2
     speed_window_frames: Annotated[
         int,
         Meta(ge=1, le=60, description="reported velocity is the displacement over these frames"),
@@ -274,7 +276,7 @@ class TrackingConfig(_Section, frozen=True):
     ] = 2
     max_range_m: Annotated[
         float,
-        Meta(gt=0, le=1000, description="detections farther from the camera are not tracked, m"),
+        Meta(gt=0, le=1000, description="nothing farther from the camera is tracked, m"),
     ] = 60.0
     max_speed_pedestrian_mps: Annotated[
         float, Meta(gt=0, le=100, description="speed gate of pedestrians, m/s")
@@ -348,18 +350,10 @@ class GpioConfig(_Section, frozen=True):
     chip: Annotated[
         str, Meta(min_length=1, description="chip by label, name or path, e.g. tegra234-gpio")
     ] = "tegra234-gpio"
-    red: Annotated[str | int | None, Meta(description="line name or offset; null: not wired")] = (
-        None
-    )
-    orange: Annotated[
-        str | int | None, Meta(description="line name or offset; null: not wired")
-    ] = None
-    green: Annotated[str | int | None, Meta(description="line name or offset; null: not wired")] = (
-        None
-    )
-    blue: Annotated[str | int | None, Meta(description="line name or offset; null: not wired")] = (
-        None
-    )
+    red: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
+    orange: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
+    green: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
+    blue: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
     active_low: Annotated[bool, Meta(description="a low line lights the lamp")] = False
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import yaml
 
@@ -39,6 +38,16 @@ TAIL_S = 0.5
 _MAX_BYTES = 1_000_000
 _MAX_DURATION_S = 3600.0
 _MAX_COORDINATE_M = 10_000.0
+_MAX_AGENTS = 1000
+#: What PyYAML raises beside YAMLError, on odd numbers, dates and explicit tags (`!!int ''`).
+_YAML_TROUBLE = (
+    ValueError,
+    OverflowError,
+    RecursionError,
+    TypeError,
+    LookupError,
+    AttributeError,
+)
 
 
 @dataclass(frozen=True)
@@ -163,8 +172,9 @@ def bundled_folder() -> Path:
 def parse_scenario(text: str, source: str) -> Scenario:
     """A scenario from YAML text; `source` names it in errors."""
     try:
+        _refuse_aliases(text, source)
         data = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
+    except (yaml.YAMLError, *_YAML_TROUBLE) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
         raise ScenarioError(f"{source}{where}: is not YAML; check the indentation") from error
@@ -174,8 +184,8 @@ def parse_scenario(text: str, source: str) -> Scenario:
     if not isinstance(name, str) or not name.strip():
         raise ScenarioError(f"{source}: name: expected a text; write name: My Scenario")
     agents_data = top.get("agents")
-    if not isinstance(agents_data, list) or not agents_data:
-        raise ScenarioError(f"{source}: agents: expected a list of at least one agent")
+    if not isinstance(agents_data, list) or not 1 <= len(agents_data) <= _MAX_AGENTS:
+        raise ScenarioError(f"{source}: agents: expected a list of 1 to {_MAX_AGENTS} agents")
     agents = tuple(_agent(item, source, i) for i, item in enumerate(agents_data))
     ids = [agent.id for agent in agents]
     twice = next((i for i in ids if ids.count(i) > 1), None)
@@ -209,17 +219,45 @@ def dump_scenario(scenario: Scenario) -> str:
         lines.append(f"story: {_quoted(scenario.story)}")
     lines.append("agents:")
     for agent in scenario.agents:
-        path = ", ".join("[" + ", ".join(repr(float(v)) for v in p) + "]" for p in agent.path)
+        path = ", ".join("[" + ", ".join(map(_real, p)) + "]" for p in agent.path)
         size = ""
         if agent.size_m != SIZES_M[agent.kind]:
-            length, width, height = agent.size_m
-            size = f", size: {{length: {length!r}, width: {width!r}, height: {height!r}}}"
+            length, width, height = map(_real, agent.size_m)
+            size = f", size: {{length: {length}, width: {width}, height: {height}}}"
         lines.append(f"  - {{id: {agent.id}, kind: {agent.kind}{size}, path: [{path}]}}")
     return "\n".join(lines) + "\n"
 
 
 def _quoted(text: str) -> str:
-    return msgspec.json.encode(text).decode()  # a JSON string is a YAML string
+    """On one line; not JSON, for YAML folds some characters that JSON leaves as they are."""
+    dumped: str = yaml.safe_dump(text, default_style='"', allow_unicode=True, width=math.inf)
+    return dumped.strip()
+
+
+def _real(number: float) -> str:
+    """Decimal text that YAML reads as the same number: to it, 1e-05 without a dot is a word."""
+    text = repr(float(number))
+    return text if "." in text else text.replace("e", ".0e")
+
+
+def _refuse_aliases(text: str, source: str) -> None:
+    """A few lines of aliases can stand for gigabytes, and nobody needs them here."""
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            mark = event.start_mark
+            raise ScenarioError(
+                f"{source}, line {mark.line + 1 if mark else '?'}: YAML aliases are not allowed; "
+                "write the value out"
+            )
+
+
+def _shown(value: object) -> str:
+    """A value in an error message: one line, not endless."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # a whole number of thousands of digits
+        return "a huge number"
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _mapping(data: object, source: str, what: str) -> Mapping[str, Any]:
@@ -233,13 +271,14 @@ def _known(data: Mapping[str, Any], known: set[str], source: str, where: str) ->
         if key not in known:
             near = difflib.get_close_matches(key, sorted(known), 1)
             mend = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}"
-            raise ScenarioError(f"{source}: {where}{key}: unknown key; {mend}")
+            name = _shown(key)[1:-1]
+            raise ScenarioError(f"{source}: {where}{name}: unknown key; {mend}")
 
 
 def _choice(value: object, allowed: tuple[str, ...], source: str, key: str) -> str:
     text = value.lower() if isinstance(value, str) else value
     if text not in allowed:
-        raise ScenarioError(f"{source}: {key}: {value!r} is not one of {', '.join(allowed)}")
+        raise ScenarioError(f"{source}: {key}: {_shown(value)} is not one of {', '.join(allowed)}")
     return str(text)
 
 
@@ -291,11 +330,11 @@ def _size(value: object, kind: str, source: str, where: str) -> tuple[float, flo
 
 def _number(value: object, source: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ScenarioError(f"{source}: {where}: {value!r} is not a number")
+        raise ScenarioError(f"{source}: {where}: {_shown(value)} is not a number")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise ScenarioError(f"{source}: {where}: {value!r} is not a finite number")
+        raise ScenarioError(f"{source}: {where}: {_shown(value)} is not a finite number")
     return number

@@ -34,8 +34,7 @@ class GroundTable:
             )
         self.camera = camera
         self.width, self.height, self.step_px = width, height, step_px
-        columns = -(-(width - 1) // step_px) + 1
-        rows = -(-(height - 1) // step_px) + 1
+        columns, rows = -(-width // step_px) + 1, -(-height // step_px) + 1
         u = np.arange(columns, dtype=np.float64) * step_px
         v = np.arange(rows, dtype=np.float64) * step_px
         self._rays: Float32Array = np.empty((rows, columns, 3), np.float32)
@@ -65,11 +64,12 @@ class GroundTable:
         """Ground positions [n, 2] in metres of crop pixels [n, 2], and which are valid [n].
 
         Within 1 cm of `GroundCamera.ground` out to 25 m. Invalid (NaN): outside the crop or the
-        image circle, on or above the horizon.
+        image circle, on or above the horizon. The crop's far edges are inside: a box that is cut
+        by the picture's lower edge ends on it.
         """
         uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
         u, v = uv[:, 0], uv[:, 1]
-        inside = (u >= 0) & (v >= 0) & (u <= self.width - 1) & (v <= self.height - 1)
+        inside = (u >= 0) & (v >= 0) & (u <= self.width) & (v <= self.height)
         gu = np.where(inside, u, 0.0) / self.step_px
         gv = np.where(inside, v, 0.0) / self.step_px
         column = np.minimum(gu.astype(np.intp), self._rays.shape[1] - 2)
@@ -103,6 +103,6 @@ def _close(ray: npt.NDArray[np.floating], truth: FloatArray, height_m: float) ->
     rim of the image circle may cross) is never close.
     """
     error = np.sqrt(((ray - truth) ** 2).sum(-1))
-    slant_sq = np.minimum((height_m / np.maximum(-truth[..., 2], 1e-9)) ** 2, REACH_M**2)
-    slant_sq = np.maximum(slant_sq, height_m**2)
+    slant_sq = (height_m / np.maximum(-truth[..., 2], 1e-9)) ** 2
+    slant_sq = np.minimum(slant_sq, REACH_M**2 + height_m**2)
     return np.asarray(error * slant_sq / height_m <= TOLERANCE_M)

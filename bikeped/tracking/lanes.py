@@ -29,7 +29,8 @@ class TrackerSettings:
     come from the configuration. `max_speed_mps` by kind (pedestrian, cyclist, vehicle) gates a
     match: a detection may lie at most speed * time since last seen + `position_noise_m` from the
     track's last seen position. `velocity_weight` is the weight of the newest step per `frame_s`.
-    With `unbiased` the smoothed velocity starts at the first step instead of at zero.
+    With `unbiased` the smoothed velocity starts at the first step instead of at zero. A track that
+    coasts farther than `max_range_m` from the origin is dropped.
     """
 
     match_radius_m: float = 3.0
@@ -40,6 +41,7 @@ class TrackerSettings:
     max_speed_mps: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     position_noise_m: float = math.inf
     unbiased: bool = False
+    max_range_m: float = math.inf
 
 
 class LaneTracker:
@@ -171,6 +173,8 @@ class LaneTracker:
             min(_TENTATIVE_S, self.settings.max_unseen_s),
         )
         self.alive &= unseen <= limit + _EPSILON_S
+        if math.isfinite(self.settings.max_range_m):
+            self.alive &= (self.xy_m**2).sum(-1) <= self.settings.max_range_m**2
 
     def _add(self, time_s: float, xy_m: FloatArray, kind: KindArray, fresh: BoolArray) -> None:
         need = fresh.sum(axis=1)
