@@ -1,0 +1,28 @@
+"""Where pictures come from: cameras, recordings and folders in, `Frame`s out.
+
+`open_source` picks the source by its text; `FrameGrabber` keeps the newest frame of a live one;
+`Paced` plays a recording as a live camera would; `JpegDecoder` decodes at the scale needed.
+"""
+
+from bikeped.capture.base import FrameSource
+from bikeped.capture.images import ImageSource
+from bikeped.capture.jpeg import JpegDecoder, read_size
+from bikeped.capture.latest import FrameGrabber
+from bikeped.capture.network import NetworkSource
+from bikeped.capture.paced import Paced
+from bikeped.capture.sources import open_source
+from bikeped.capture.v4l2 import V4l2Source
+from bikeped.capture.video import VideoSource
+
+__all__ = [
+    "FrameGrabber",
+    "FrameSource",
+    "ImageSource",
+    "JpegDecoder",
+    "NetworkSource",
+    "Paced",
+    "V4l2Source",
+    "VideoSource",
+    "open_source",
+    "read_size",
+]

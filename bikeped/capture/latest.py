@@ -1,0 +1,246 @@
+"""The newest frame of a live source, read in a thread that reopens it when it breaks."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from bikeped.capture.base import FrameSource
+from bikeped.errors import CaptureError
+from bikeped.types import Frame
+
+_log = logging.getLogger(__name__)
+
+_Result = TypeVar("_Result")
+
+
+def backoff_s(failures: int, first_s: float, most_s: float) -> float:
+    """Pause before the next attempt, after `failures` (1 or more) in a row: doubled each time."""
+    return float(min(first_s * 2.0 ** min(failures - 1, 60), most_s))
+
+
+class FrameGrabber:
+    """Reads a live source in its own thread and keeps only the newest frame.
+
+    `open_source` opens a fresh source; it is called in the thread, first at `start` and again after
+    an error, after `restart` and when the source delivers nothing newer for `stale_after_s` (a read
+    that has not returned at all cannot be ended: see `hung_s`). Attempts are `first_pause_s` apart,
+    doubled up to `most_pause_s`, and from the start again once a source has delivered for
+    `healthy_after_s`. A source that ends (None: a paced recording) stops the thread: see `ended`.
+
+    Frame numbers count on across restarts. `next` is for one consumer; everything else may be
+    called from any thread. Times are seconds on `clock`.
+    """
+
+    def __init__(
+        self,
+        open_source: Callable[[], FrameSource],
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        stale_after_s: float = 2.0,
+        first_pause_s: float = 0.25,
+        most_pause_s: float = 8.0,
+        healthy_after_s: float = 1.0,
+    ) -> None:
+        self._open_source = open_source
+        self._clock = clock
+        self._stale_after_s = stale_after_s
+        self._first_pause_s, self._most_pause_s = first_pause_s, most_pause_s
+        self._healthy_after_s = healthy_after_s
+        self._stop = threading.Event()
+        self._restart = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="frame-grabber", daemon=True)
+        self._failures = 0  # of the reading thread alone
+        self._lock = threading.Lock()  # guards everything below
+        self._latest: Frame | None = None
+        self._taken = True
+        self._waiter: tuple[asyncio.AbstractEventLoop, asyncio.Event] | None = None
+        self._frames = 0
+        self._dropped = 0
+        self._opened = 0
+        self._error: CaptureError | None = None
+        self._ended = False
+        self._arrived_s: float | None = None
+        self._busy_since_s: float | None = None
+
+    def start(self) -> None:
+        """Starts the thread, once."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 2.0) -> bool:
+        """Ends the thread, waiting up to `timeout_s`: call it outside the event loop.
+
+        False when it hangs in the source and had to be left behind (it is a daemon thread).
+        """
+        self._stop.set()
+        self._wake()
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def restart(self) -> None:
+        """Asks for a fresh source, once the read under way has returned."""
+        self._restart.set()
+
+    async def next(self, timeout_s: float) -> Frame | None:
+        """The newest frame that was not taken yet; waits for one up to `timeout_s`.
+
+        None when none came in time, after `stop`, and at the end of a recording.
+        """
+        wake = asyncio.Event()
+        with self._lock:
+            if self._waiter is not None:
+                raise RuntimeError("FrameGrabber.next has one consumer, and it is waiting already")
+            frame = self._take()
+            if frame is not None or self._ended or self._stop.is_set():
+                return frame
+            self._waiter = (asyncio.get_running_loop(), wake)
+        try:
+            await asyncio.wait_for(wake.wait(), timeout_s)
+        except asyncio.TimeoutError:
+            pass  # a frame may have come at this very moment, so look once more
+        finally:
+            with self._lock:
+                self._waiter = None
+        with self._lock:
+            return self._take()
+
+    @property
+    def latest(self) -> Frame | None:
+        """The newest frame, taken or not; it counts as neither taken nor dropped by this."""
+        with self._lock:
+            return self._latest
+
+    @property
+    def frames(self) -> int:
+        """Frames that arrived."""
+        with self._lock:
+            return self._frames
+
+    @property
+    def dropped(self) -> int:
+        """Frames that a newer one replaced before they were taken."""
+        with self._lock:
+            return self._dropped
+
+    @property
+    def restarts(self) -> int:
+        """How often the source was opened again with success."""
+        with self._lock:
+            return max(self._opened - 1, 0)
+
+    @property
+    def error(self) -> CaptureError | None:
+        """Why there are no frames; None from the first frame of a fresh source on."""
+        with self._lock:
+            return self._error
+
+    @property
+    def ended(self) -> bool:
+        """Whether the source has come to its end."""
+        with self._lock:
+            return self._ended
+
+    def age_s(self, now_s: float) -> float:
+        """Time since the last frame arrived; infinite before the first."""
+        with self._lock:
+            return math.inf if self._arrived_s is None else now_s - self._arrived_s
+
+    def hung_s(self, now_s: float) -> float:
+        """For how long the call into the source under way (open, read, close) has not returned."""
+        with self._lock:
+            return 0.0 if self._busy_since_s is None else max(now_s - self._busy_since_s, 0.0)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._one_source()
+            except CaptureError as error:
+                self._failed(error)
+            except Exception as error:  # noqa: BLE001  (the thread must outlive a bug)
+                _log.exception("the camera's source failed")
+                self._failed(CaptureError(f"camera.source: {type(error).__name__}: {error}"))
+            with self._lock:
+                if self._ended:
+                    break
+            if self._failures and not self._stop.is_set():
+                self._stop.wait(backoff_s(self._failures, self._first_pause_s, self._most_pause_s))
+        self._wake()
+
+    def _one_source(self) -> None:
+        """Opens a source and reads it until it breaks (raises), ends, or a fresh one is wanted."""
+        self._restart.clear()
+        source = self._timed(self._open_source)
+        try:
+            opened_s = fresh_s = self._clock()
+            with self._lock:
+                self._opened += 1
+            last_captured_s = -math.inf
+            while not (self._stop.is_set() or self._restart.is_set()):
+                frame = self._timed(source.read)
+                if frame is None:
+                    with self._lock:
+                        self._ended = True
+                    return
+                now_s = self._clock()
+                if frame.captured_s > last_captured_s:
+                    last_captured_s, fresh_s = frame.captured_s, now_s
+                    self._publish(frame, now_s)
+                    if now_s - opened_s >= self._healthy_after_s:
+                        self._failures = 0
+                elif now_s - fresh_s > self._stale_after_s:
+                    raise CaptureError(
+                        f"{source.name}: no newer picture for {now_s - fresh_s:.1f} s; "
+                        "is it still plugged in?"
+                    )
+        finally:
+            self._timed(source.close)
+
+    def _timed(self, call: Callable[[], _Result]) -> _Result:
+        with self._lock:
+            self._busy_since_s = self._clock()
+        try:
+            return call()
+        finally:
+            with self._lock:
+                self._busy_since_s = None
+
+    def _publish(self, frame: Frame, now_s: float) -> None:
+        with self._lock:
+            if not self._taken:
+                self._dropped += 1
+            self._latest = dataclasses.replace(frame, number=self._frames)
+            self._taken = False
+            self._frames += 1
+            self._arrived_s = now_s
+            self._error = None
+        self._wake()
+
+    def _take(self) -> Frame | None:
+        """The newest frame if it is new; the lock must be held."""
+        if self._taken:
+            return None
+        self._taken = True
+        return self._latest
+
+    def _failed(self, error: CaptureError) -> None:
+        self._failures += 1
+        with self._lock:
+            self._error = error
+        _log.warning("%s (attempt %d follows)", error, self._failures + 1)
+
+    def _wake(self) -> None:
+        with self._lock:
+            if self._waiter is None:
+                return
+            loop, wake = self._waiter
+            try:
+                loop.call_soon_threadsafe(wake.set)
+            except RuntimeError:
+                self._waiter = None  # the loop is closed: nobody waits any more

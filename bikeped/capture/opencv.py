@@ -1,0 +1,198 @@
+"""OpenCV's VideoCapture as this package uses it: opening, raw packets, colours.
+
+`Picture` is one picture as OpenCV gave it. `FfmpegReader` is the common part of recordings and
+network streams: Motion JPEG is handed on undecoded, everything else as RGB.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from bikeped.capture.jpeg import SOI, read_size
+from bikeped.errors import CaptureError
+from bikeped.types import ImageArray
+
+# Codec tags that OpenCV's FFmpeg backend reports for Motion JPEG in AVI, MKV, MOV and MP4.
+JPEG_TAGS = frozenset({"MJPG", "mjpg", "jpeg", "JPEG", "AVRn"})
+MAX_FPS = 1000.0
+
+
+class Capture(Protocol):
+    """The part of cv2.VideoCapture in use: the seam at which tests put a fake device."""
+
+    def isOpened(self) -> bool: ...  # noqa: N802  (OpenCV's name)
+    def get(self, prop: int, /) -> float: ...
+    def set(self, prop: int, value: float, /) -> bool: ...
+    def read(self) -> tuple[bool, Any]: ...
+    def release(self) -> None: ...
+
+
+OpenCapture = Callable[..., Capture]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture: `jpeg` or `rgb` is set, as in Frame."""
+
+    jpeg: bytes | None
+    rgb: ImageArray | None
+    media_s: float  #: the container's time stamp, seconds; meaningless for some containers
+
+
+def as_rgb(picture: ImageArray) -> ImageArray:
+    """Height x width x 3 RGB of what OpenCV decoded (BGR or grey)."""
+    grey = picture.ndim == 2 or picture.shape[2] == 1
+    code = cv2.COLOR_GRAY2RGB if grey else cv2.COLOR_BGR2RGB
+    return np.asarray(cv2.cvtColor(picture, code), np.uint8)
+
+
+def fourcc_text(code: float) -> str:
+    """`MJPG` of the number that OpenCV holds it in; an empty text where there is none."""
+    if not math.isfinite(code) or code <= 0:
+        return ""
+    return int(code).to_bytes(8, "little")[:4].decode("latin-1").rstrip("\0 ")
+
+
+def usable_fps(fps: float) -> bool:
+    """Whether a container's rate can be one; OpenCV gives 0, negative or NaN for none."""
+    return math.isfinite(fps) and 0.0 < fps <= MAX_FPS
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps OpenCV and FFmpeg from writing to standard error.
+
+    What is wrong with a file is said by our own one line. A person's own setting is left alone;
+    FFmpeg's is read once, by the first capture of the process.
+    """
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(min(level, cv2.utils.logging.LOG_LEVEL_ERROR))
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+class FfmpegReader:
+    """The pictures of one file or address, through OpenCV's FFmpeg backend.
+
+    The first picture is read at once: it proves that the source holds pictures, and shows whether
+    its packets are whole JPEGs of the promised size (interlaced ones hold two, of half the height).
+    If not, the source is opened again and decoded here. Packets may lack the Huffman tables, as AVI
+    allows: libjpeg-turbo, and so every decoder in use, then takes the standard ones.
+
+    `label` stands for the source in messages, `mend` ends them. Raises CaptureError.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        label: str,
+        *,
+        mend: str,
+        params: Sequence[int] = (),
+        open_capture: OpenCapture = cv2.VideoCapture,
+    ) -> None:
+        self._address, self._label, self._mend = address, label, mend
+        # No hardware decoding: two runs over one recording must give the same bytes.
+        self._params = [
+            int(cv2.CAP_PROP_HW_ACCELERATION),
+            int(cv2.VIDEO_ACCELERATION_NONE),
+            *params,
+        ]
+        self._open_capture = open_capture
+        self._capture = self._open()
+        self._raw = self._ask_raw()
+        first = self._read()
+        if self._raw and not self._whole_jpeg(first):
+            self._capture.release()
+            self._capture = self._open()
+            self._raw = False
+            first = self._read()
+        if first is None:
+            self._capture.release()
+            raise CaptureError(f"{label}: holds no picture that can be read; {mend}")
+        self._first: Picture | None = first
+        self.fps = self._capture.get(cv2.CAP_PROP_FPS)
+        self.promised = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.width, self.height = self._size(first)
+
+    @property
+    def raw(self) -> bool:
+        """Whether pictures come as JPEG."""
+        return self._raw
+
+    def read(self) -> Picture | None:
+        """The next picture, or None: the end of a file, or a stream that broke off."""
+        if self._first is not None:
+            first, self._first = self._first, None
+            return first
+        return self._read()
+
+    def close(self) -> None:
+        """Closes the file or connection."""
+        self._first = None
+        self._capture.release()
+
+    def _open(self) -> Capture:
+        try:
+            with quiet():
+                capture = self._open_capture(self._address, cv2.CAP_FFMPEG, self._params)
+                opened = capture.isOpened()
+        except cv2.error as error:
+            raise self._broken("opened", error) from error
+        if not opened:
+            raise CaptureError(f"{self._label}: cannot be opened; {self._mend}")
+        return capture
+
+    def _broken(self, what: str, error: cv2.error) -> CaptureError:
+        # An address may hold a password, which must not get into a message.
+        why = str(error.err).replace(self._address, self._label)
+        return CaptureError(f"{self._label}: cannot be {what} ({why}); {self._mend}")
+
+    def _ask_raw(self) -> bool:
+        # A turned picture must be turned back, which only OpenCV's decoding does.
+        if self._capture.get(cv2.CAP_PROP_ORIENTATION_META) not in (0.0, -1.0):
+            return False
+        if fourcc_text(self._capture.get(cv2.CAP_PROP_FOURCC)) not in JPEG_TAGS:
+            return False
+        return bool(self._capture.set(cv2.CAP_PROP_FORMAT, -1))
+
+    def _whole_jpeg(self, picture: Picture | None) -> bool:
+        if picture is None or picture.jpeg is None or not picture.jpeg.startswith(SOI):
+            return False
+        try:
+            return read_size(picture.jpeg) == self._promised_size()
+        except CaptureError:
+            return False
+
+    def _promised_size(self) -> tuple[int, int]:
+        get = self._capture.get
+        return int(get(cv2.CAP_PROP_FRAME_WIDTH)), int(get(cv2.CAP_PROP_FRAME_HEIGHT))
+
+    def _size(self, picture: Picture) -> tuple[int, int]:
+        if picture.rgb is None:
+            return self._promised_size()
+        return picture.rgb.shape[1], picture.rgb.shape[0]
+
+    def _read(self) -> Picture | None:
+        try:
+            ok, data = self._capture.read()
+        except cv2.error as error:
+            raise self._broken("decoded", error) from error
+        if not ok or data is None:
+            return None
+        media_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+        if self._raw:
+            return Picture(data.tobytes(), None, media_s)
+        return Picture(None, as_rgb(data), media_s)

@@ -1,0 +1,206 @@
+"""A camera at /dev/videoN, through OpenCV's V4L2 backend.
+
+With CAP_PROP_CONVERT_RGB off OpenCV hands on the Motion JPEG as the camera wrote it, and
+CAP_PROP_POS_MSEC is the kernel's time stamp of the buffer. Not run on a real camera yet: it was
+written from OpenCV's documented behaviour and is tested against a fake at cv2.VideoCapture.
+
+A read that the driver never answers cannot be ended from here; `FrameGrabber.hung_s` shows it.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bikeped.capture.base import FrameSource
+from bikeped.capture.jpeg import EOI, read_size
+from bikeped.capture.opencv import Capture, OpenCapture, as_rgb, fourcc_text, quiet, usable_fps
+from bikeped.errors import CaptureError
+from bikeped.types import Frame, ImageArray
+
+_log = logging.getLogger(__name__)
+
+JPEG_FORMATS = frozenset({"MJPG", "JPEG"})
+# A stamp older than this, or in the future, is not from the monotonic clock.
+MAX_STAMP_AGE_S = 2.0
+# OpenCV repeats its last buffer, without waiting, after some unplugs.
+MAX_REPEATING_S = 1.0
+REPEAT_PAUSE_S = 0.005
+
+
+class V4l2Source(FrameSource):
+    """A V4L2 camera by device path or number. `captured_s` is on the monotonic clock.
+
+    `fourcc` MJPG gives JPEG frames; any other format is converted to RGB by OpenCV. Raises
+    CaptureError when the camera is missing, busy or grants another size or format. `clock`,
+    `sleep` and `open_capture` are for tests.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        device: str,
+        *,
+        width: int,
+        height: int,
+        fps: float,
+        fourcc: str = "MJPG",
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+        open_capture: OpenCapture = cv2.VideoCapture,
+    ) -> None:
+        self.name = f"/dev/video{int(device)}" if device.isdecimal() else device
+        if len(fourcc) != 4:
+            raise CaptureError(f"camera.fourcc: {fourcc!r} must have four characters, e.g. MJPG")
+        self.width, self.height = width, height
+        self._clock, self._sleep = clock, sleep
+        self._raw = fourcc in JPEG_FORMATS
+        self._number = 0
+        self._last: tuple[float, bytes | ImageArray] | None = None
+        self._last_s = -math.inf
+        self._capture = self._open(open_capture)
+        try:
+            self.fps = self._set_up(fps, fourcc)
+        except BaseException:
+            self._capture.release()
+            raise
+
+    def read(self) -> Frame:
+        repeating_since_s: float | None = None
+        while True:
+            ok, data = self._grab()
+            if not ok or data is None or data.size == 0:
+                raise CaptureError(f"{self.name}: gave no picture; is it still plugged in?")
+            stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+            picture = trim(data.tobytes()) if self._raw else np.asarray(data, np.uint8)
+            if not self._repeated(stamp_ms, picture):
+                return self._frame(stamp_ms, picture)
+            now_s = self._clock()
+            if repeating_since_s is None:
+                repeating_since_s = now_s
+            elif now_s - repeating_since_s > MAX_REPEATING_S:
+                raise CaptureError(
+                    f"{self.name}: repeats its last picture; is it still plugged in?"
+                )
+            self._sleep(REPEAT_PAUSE_S)
+
+    def close(self) -> None:
+        self._capture.release()
+
+    def _open(self, open_capture: OpenCapture) -> Capture:
+        try:
+            with quiet():
+                capture = open_capture(self.name, cv2.CAP_V4L2)
+                opened = capture.isOpened()
+        except cv2.error as error:
+            raise CaptureError(f"{self.name}: cannot be opened ({error.err})") from error
+        if not opened:
+            raise CaptureError(f"{self.name}: {_why_not_opened(Path(self.name))}")
+        return capture
+
+    def _set_up(self, fps: float, fourcc: str) -> float:
+        """Asks for format, size and rate, in this order; the rate that was granted."""
+        capture = self._capture
+        code = cv2.VideoWriter.fourcc(fourcc[0], fourcc[1], fourcc[2], fourcc[3])
+        capture.set(cv2.CAP_PROP_FOURCC, code)
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.height)
+        capture.set(cv2.CAP_PROP_FPS, fps)
+        granted = (
+            int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+            int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+        )
+        if granted != (self.width, self.height):
+            raise CaptureError(
+                f"{self.name}: grants {granted[0]}x{granted[1]}, not {self.width}x{self.height}; "
+                f"set camera.width and camera.height to a size that "
+                f"`v4l2-ctl -d {self.name} --list-formats-ext` shows for {fourcc}"
+            )
+        format_ = fourcc_text(capture.get(cv2.CAP_PROP_FOURCC))
+        if format_ != fourcc.rstrip() and not (self._raw and format_ in JPEG_FORMATS):
+            raise CaptureError(
+                f"{self.name}: grants the format {format_ or 'unknown'}, not {fourcc}; set "
+                f"camera.fourcc to one that `v4l2-ctl -d {self.name} --list-formats-ext` shows"
+            )
+        if self._raw and not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0):
+            raise CaptureError(
+                f"{self.name}: OpenCV cannot hand on its JPEGs; update opencv-python"
+            )
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        if not usable_fps(rate):
+            return fps
+        if abs(rate - fps) > 0.05 * fps:
+            _log.warning("%s: grants %.3g pictures a second, not %.3g", self.name, rate, fps)
+        return rate
+
+    def _grab(self) -> tuple[bool, ImageArray | None]:
+        try:
+            return self._capture.read()
+        except cv2.error as error:
+            raise CaptureError(f"{self.name}: cannot be read ({error.err})") from error
+
+    def _repeated(self, stamp_ms: float, picture: bytes | ImageArray) -> bool:
+        """Whether this is the last buffer once more: same stamp and same bytes."""
+        last, self._last = self._last, (stamp_ms, picture)
+        if last is None or last[0] != stamp_ms:
+            return False
+        if isinstance(picture, bytes):
+            return picture == last[1]
+        return np.array_equal(picture, last[1])
+
+    def _frame(self, stamp_ms: float, picture: bytes | ImageArray) -> Frame:
+        if self._number == 0:
+            self._check_size(picture)
+        now_s = self._clock()
+        captured_s = stamp_ms / 1000.0
+        # Not a stamp of the monotonic clock, or one that stands still: the arrival must do.
+        if not (0.0 <= now_s - captured_s <= MAX_STAMP_AGE_S and captured_s > self._last_s):
+            captured_s = now_s
+        self._last_s = captured_s
+        jpeg, rgb = (picture, None) if isinstance(picture, bytes) else (None, as_rgb(picture))
+        frame = Frame(self._number, captured_s, self.width, self.height, jpeg, rgb)
+        self._number += 1
+        return frame
+
+    def _check_size(self, picture: bytes | ImageArray) -> None:
+        """The pictures themselves must have the size that was granted."""
+        if isinstance(picture, bytes):
+            try:
+                size = read_size(picture)
+            except CaptureError:
+                return  # a damaged first picture is the decoder's matter
+        else:
+            size = picture.shape[1], picture.shape[0]
+        if size != (self.width, self.height):
+            raise CaptureError(
+                f"{self.name}: grants {self.width}x{self.height} but sends {size[0]}x{size[1]}; "
+                "set camera.width and camera.height to that"
+            )
+
+
+def trim(data: bytes) -> bytes:
+    """The JPEG without what drivers leave behind it in the buffer.
+
+    Searched from the end, so that it costs no more than the padding is long. Without an end marker
+    the bytes stay as they are, and the decoder refuses them.
+    """
+    if data.endswith(EOI):
+        return data
+    end = data.rfind(EOI)
+    return data if end < 0 else data[: end + len(EOI)]
+
+
+def _why_not_opened(path: Path) -> str:
+    if not path.exists():
+        return "no such camera; plug it in, or set camera.source (`v4l2-ctl --list-devices`)"
+    if not os.access(path, os.R_OK | os.W_OK):
+        return "no permission; add this user to group video"
+    return "cannot be opened; is it a camera, and is another program using it (`fuser -v`)?"
