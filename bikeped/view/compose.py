@@ -1,0 +1,70 @@
+"""Picture and radar side by side in one frame of fixed size, and JPEG for the live view."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import simplejpeg
+
+from bikeped.types import ImageArray
+from bikeped.view.draw import INK
+from bikeped.view.moment import GroundToFrame, Moment
+from bikeped.view.overlay import draw_banner, draw_overlay
+from bikeped.view.radar import draw_radar
+
+#: Share of the width that the camera's picture takes.
+_PICTURE = 0.705
+
+
+def compose(
+    rgb: ImageArray,
+    moment: Moment,
+    size: tuple[int, int] = (1600, 720),
+    *,
+    frame_width: int | None = None,
+    ground_to_frame: GroundToFrame | None = None,
+    range_m: float = 25.0,
+    fov_deg: float = 198.0,
+    heading_deg: float = 0.0,
+) -> ImageArray:
+    """One frame of `size` (width, height): the state above, the picture left, the radar right.
+
+    `rgb` [h, w, 3] may be a scaled copy of the frame; `frame_width` then is the full frame's
+    width, in whose pixels the boxes are (None: `rgb` is the full frame).
+    """
+    width, height = size
+    top = int(np.clip(round(height * 0.105), 34, 110))
+    left = round(width * _PICTURE)
+    h, w = rgb.shape[:2]
+    fit = min(left / w, (height - top) / h)
+    pw, ph = max(round(w * fit), 2), max(round(h * fit), 2)
+    how = cv2.INTER_AREA if fit < 1 else cv2.INTER_LINEAR
+    small = np.asarray(cv2.resize(rgb, (pw, ph), interpolation=how), dtype=np.uint8)
+    picture = draw_overlay(
+        small,
+        moment,
+        scale=pw / (frame_width or w),
+        ground_to_frame=ground_to_frame,
+        banner=False,
+    )
+    out: ImageArray = np.empty((height, width, 3), np.uint8)
+    out[:] = INK
+    y = top + (height - top - ph) // 2
+    out[y : y + ph, (left - pw) // 2 : (left - pw) // 2 + pw] = picture
+    out[top:, left:] = draw_radar(
+        moment,
+        (width - left, height - top),
+        range_m=range_m,
+        fov_deg=fov_deg,
+        heading_deg=heading_deg,
+    )
+    draw_banner(out, moment, (0, 0, width, top))
+    return out
+
+
+def encode_jpeg(rgb: ImageArray, quality: int = 85) -> bytes:
+    """`rgb` [h, w, 3] as a JPEG file."""
+    data: bytes = simplejpeg.encode_jpeg(
+        np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420"
+    )
+    return data

@@ -1,0 +1,88 @@
+"""Pictures into an MP4 file. The only part of the view that touches the disk."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+
+from bikeped.errors import CaptureError
+from bikeped.types import ImageArray
+
+
+class VideoSink:
+    """Writes RGB pictures of one size to `path` (.mp4).
+
+    Writes beside it under a temporary name and renames at `close`, so that a half-written file
+    never stands under the asked-for name. As a context manager an exception discards the file.
+    """
+
+    def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
+        """Opens the file. `size` is width, height. Raises CaptureError when it cannot."""
+        self.path, self.size, self.frames = path, size, 0
+        if path.suffix.lower() != ".mp4":
+            raise CaptureError(f"{path}: is not an .mp4 name; end the overlay's name with .mp4")
+        if not path.parent.is_dir():
+            raise CaptureError(f"{path}: its folder does not exist; make {path.parent} first")
+        if not os.access(path.parent, os.W_OK):
+            raise CaptureError(f"{path}: its folder is not writable; choose another folder")
+        self._partial = path.with_name(f".{path.stem}.partial-{os.getpid()}.mp4")
+        fourcc = cv2.VideoWriter.fourcc(*"mp4v")
+        self._writer: cv2.VideoWriter | None = cv2.VideoWriter(
+            str(self._partial), fourcc, fps, size
+        )
+        if not self._writer.isOpened():
+            self.discard()
+            raise CaptureError(
+                f"{path}: OpenCV cannot write MP4 ({size[0]} x {size[1]}, {fps:g} fps); check the "
+                "free disk space and that opencv-python-headless is the one from PyPI"
+            )
+
+    def write(self, rgb: ImageArray) -> None:
+        """Appends one picture [height, width, 3]; ValueError when its size is another."""
+        if self._writer is None:
+            raise ValueError(f"{self.path}: is closed already")
+        if rgb.shape != (self.size[1], self.size[0], 3):
+            # OpenCV drops such a frame without a word.
+            raise ValueError(f"VideoSink: expected {self.size}, got shape {rgb.shape}")
+        self._writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        self.frames += 1
+
+    def close(self) -> None:
+        """Finishes the file and gives it its name. Does nothing when called again."""
+        if self._writer is None:
+            return
+        self._writer.release()
+        self._writer = None
+        if self.frames == 0 or not self._partial.exists():
+            self._partial.unlink(missing_ok=True)
+            raise CaptureError(f"{self.path}: no picture was written; check the recording")
+        try:
+            self._partial.replace(self.path)
+        except OSError as error:
+            raise CaptureError(
+                f"{self.path}: cannot be written ({error.strerror}); choose another name"
+            ) from error
+
+    def discard(self) -> None:
+        """Stops and removes what was written so far."""
+        if self._writer is not None:
+            self._writer.release()
+            self._writer = None
+        self._partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> VideoSink:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()

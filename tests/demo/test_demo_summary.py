@@ -1,0 +1,127 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_demo_scene import CAMERA, FRAMING
+
+from bikeped.config import load_config
+from bikeped.config.build import rule_settings, tracker_settings
+from bikeped.conformance.scenario import load_scenario
+from bikeped.decision import Decider
+from bikeped.demo import DEMO_POSE, Scene, bundled_scenario, format_summary, summarise
+from bikeped.demo.detector import _KIND
+from bikeped.tracking import Tracker
+from bikeped.types import Detections, GroundPoints
+
+CONFIG = Path(__file__).parents[2] / "config.yaml"
+
+
+def event(t, state, pair=None, gap=10.0, lost=False, **more):
+    tracks = [
+        {"id": 1, "kind": "pedestrian", "x": 5.0, "y": 0.0, "lost": False},
+        {"id": 2, "kind": "cyclist", "x": 5.0, "y": gap, "lost": lost},
+    ]
+    return {"t": t, "frame": round(t * 10), "state": state, "pair": pair, "tracks": tracks, **more}
+
+
+def test_numbers_of_a_simple_run():
+    events = [{"config_hash": "x", "version": "1"}]
+    events += [event(0.1 * i, "SAFE") for i in range(10)]
+    events += [event(1.0 + 0.1 * i, "ALERT", [2, 1], 10.0 - i) for i in range(5)]
+    events += [
+        event(1.5 + 0.1 * i, "WARNING", [2, 1], [5.0, 3.0, 4.0, 6.0, 8.0][i]) for i in range(5)
+    ]
+    summary = summarise(events, "A run")
+    assert summary["frames"] == 20
+    assert summary["duration_s"] == pytest.approx(1.9)
+    assert summary["state_share"] == {"IDLE": 0.0, "SAFE": 0.5, "WARNING": 0.25, "ALERT": 0.25}
+    assert summary["state_order"] == ["SAFE", "ALERT", "WARNING"]
+    (alert,) = summary["alerts"]
+    assert alert["t"] == pytest.approx(1.0)
+    assert alert["pair"] == [2, 1]
+    assert alert["distance_m"] == 10.0
+    assert alert["lead_s"] == pytest.approx(0.6)
+    assert alert["closest_m"] == 3.0
+    assert "cyclist 2" in alert["sentence"]
+    json.dumps(summary)
+
+
+def test_flicker_is_one_alert_and_a_second_pass_is_another():
+    events = [
+        event(0.0, "ALERT", [2, 1], 9),
+        event(0.1, "WARNING", [2, 1], 8),
+        event(0.2, "ALERT", [2, 1], 7, sentence="from the rule"),
+        event(3.0, "WARNING", [2, 1], 12),
+        event(5.0, "ALERT", [2, 1], 6, sentence="from the rule"),
+        event(5.1, "ALERT", [3, 1], 6),
+    ]
+    alerts = summarise(events)["alerts"]
+    assert [a["t"] for a in alerts] == [0.0, 5.0, 5.1]
+    assert alerts[0]["lead_s"] == pytest.approx(0.2), "the second pass is not the first's lead"
+    assert alerts[1]["sentence"] == "from the rule"
+    assert alerts[2]["lead_s"] is None
+    assert alerts[2]["distance_m"] is None
+
+
+def test_coasting_does_not_count_as_the_closest_approach():
+    events = [event(0.0, "ALERT", [2, 1], 9), event(0.1, "ALERT", [2, 1], 1.0, lost=True)]
+    assert summarise(events)["alerts"][0]["closest_m"] == 9.0
+
+
+def test_text_says_that_detections_are_simulated():
+    text = format_summary(
+        summarise([event(0.0, "ALERT", [2, 1]), event(0.5, "ALERT", [2, 1], 4.0)])
+    )
+    assert "No detector model is bundled" in text
+    assert "simulated" in text
+    assert "0.5 s before the closest approach (4.0 m)" in text
+    assert format_summary(summarise([]))
+
+
+def test_the_story_passes_through_all_four_states():
+    """Boxes, ground, tracker and rule with the shipped configuration; no pictures needed."""
+    loaded = load_config(CONFIG)
+    tracker = Tracker(tracker_settings(loaded.config.tracking))
+    decider = Decider(rule_settings(loaded.config.decision))
+    scenario = load_scenario(bundled_scenario())
+    scene = Scene(scenario, CAMERA, FRAMING, DEMO_POSE, (320, 180))
+    # Boxes do not depend on the pictures: those of the full frame, without drawing it.
+    scene.size = (1920, 1080)
+    scene.eye = type(scene.eye)(CAMERA, DEMO_POSE, FRAMING.for_frame(1920, 1080))
+    events = []
+    for number, t in enumerate(scenario.frame_times(30).tolist()):
+        found = scene.objects(t)
+        detections = Detections(
+            np.array([_KIND[o.kind] for o in found], np.int8),
+            np.full(len(found), 0.9, np.float32),
+            np.array([o.box_px for o in found], np.float32).reshape(-1, 4),
+        )
+        xy, valid = CAMERA.ground(scene.eye.framing.frame_to_crop(detections.bottom_centre_px()))
+        index = np.flatnonzero(valid).astype(np.int64)
+        tracks = tracker.update(GroundPoints(detections.kind[index], xy[index], index), t)
+        decision = decider.step(t, tracks.id, tracks.kind, tracks.xy_m)
+        pair = decision.pair
+        events.append(
+            {
+                "t": t,
+                "frame": number,
+                "state": decision.state.name,
+                "pair": [pair.cyclist_id, pair.pedestrian_id] if pair else None,
+                "tracks": [
+                    {"id": i, "x": x, "y": y, "lost": u > 0}
+                    for i, (x, y), u in zip(
+                        tracks.id.tolist(),
+                        tracks.xy_m.tolist(),
+                        tracks.unseen_s.tolist(),
+                        strict=True,
+                    )
+                ],
+            }
+        )
+    summary = summarise(events)
+    assert summary["state_order"] == ["IDLE", "SAFE", "WARNING", "ALERT", "WARNING"]
+    assert min(summary["state_share"].values()) > 0.05
+    (alert,) = summary["alerts"]
+    assert alert["lead_s"] > 3.0
+    assert alert["closest_m"] > 2.0, "the warned cyclist keeps clear"
