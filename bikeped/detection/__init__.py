@@ -1,0 +1,5 @@
+"""Pictures in, road users out: the network, its layouts, and the rider-on-a-cycle rule."""
+
+from bikeped.detection.base import Detector, DetectorAnswer, load_detector
+
+__all__ = ["Detector", "DetectorAnswer", "load_detector"]

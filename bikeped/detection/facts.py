@@ -1,0 +1,161 @@
+"""What a model file says about itself: class names, input size, task.
+
+Ultralytics writes its facts as text into the ONNX metadata map (each value a Python literal) and as
+JSON in front of a TensorRT engine. Both come here as one mapping; a value may be text or already a
+value. Nothing is evaluated: `ast.literal_eval` accepts literals only.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.errors import DetectorError
+
+_LONGEST_LITERAL = 1 << 20
+_DEFAULT_SIZE = 640  #: Ultralytics' default, where neither the shape nor the metadata names one
+_LARGEST_SIDE = 16384
+_INPUT_TYPES = (np.dtype(np.float32), np.dtype(np.float16), np.dtype(np.uint8))
+
+
+@dataclass(frozen=True)
+class ModelMetadata:
+    """The facts of a model's metadata that bikeped uses; None where it says nothing."""
+
+    names: tuple[str, ...] | None = None  #: class names in order of their index
+    image_size: tuple[int, int] | None = None  #: width, height
+    task: str | None = None
+    end_to_end: bool = False  #: the answer is [1, n, 6], suppression done by the network
+    ultralytics: bool = False  #: written by Ultralytics' exporter
+
+
+@dataclass(frozen=True)
+class InputSpec:
+    """The network's one input: [1, 3, height, width] of `dtype` (float32, float16 or uint8)."""
+
+    name: str
+    width: int
+    height: int
+    dtype: np.dtype[Any]
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the input array."""
+        return (1, 3, self.height, self.width)
+
+    def buffer(self) -> npt.NDArray[Any]:
+        """A fresh contiguous input array, zeroed."""
+        return np.zeros(self.shape, self.dtype)
+
+
+def parse_metadata(entries: Mapping[str, object], source: str) -> ModelMetadata:
+    """The facts in a model's metadata map. Raises `DetectorError` where the class names are bad.
+
+    Malformed names are refused rather than passed over: guessing the names of classes could turn
+    pedestrians into something else.
+    """
+    arguments = _literal(entries.get("args"))
+    nms_inside = isinstance(arguments, Mapping) and arguments.get("nms") is True
+    task = entries.get("task")
+    author = entries.get("author")
+    return ModelMetadata(
+        names=_names(entries["names"], source) if "names" in entries else None,
+        image_size=_image_size(_literal(entries.get("imgsz"))),
+        task=task.strip().lower() if isinstance(task, str) else None,
+        end_to_end=nms_inside or _is_true(entries.get("end2end")),
+        ultralytics="imgsz" in entries
+        or "task" in entries
+        or (isinstance(author, str) and "ultralytics" in author.lower()),
+    )
+
+
+def resolve_input(
+    name: str,
+    shape: Sequence[object],
+    dtype: npt.DTypeLike,
+    metadata: ModelMetadata,
+    source: str,
+) -> InputSpec:
+    """The input with every dynamic dimension filled in.
+
+    `shape` is as the runtime gives it: integers, and names, None or -1 where dynamic. A dynamic
+    height or width is the metadata's `imgsz`, else 640. Raises `DetectorError` for any other input.
+    """
+    if len(shape) != 4:
+        raise DetectorError(
+            f"{source}: input {name} has shape {list(shape)}; bikeped needs [1, 3, height, width]"
+        )
+    batch, channels, height, width = (
+        d if isinstance(d, int) and not isinstance(d, bool) and d > 0 else None for d in shape
+    )
+    if batch not in (None, 1):
+        raise DetectorError(f"{source}: input {name} has batch size {batch}; export with batch 1")
+    if channels not in (None, 3):
+        raise DetectorError(
+            f"{source}: input {name} has shape {list(shape)}; bikeped needs [1, 3, height, width], "
+            "three channels first"
+        )
+    known_width, known_height = metadata.image_size or (_DEFAULT_SIZE, _DEFAULT_SIZE)
+    width, height = width or known_width, height or known_height
+    if not (32 <= width <= _LARGEST_SIDE and 32 <= height <= _LARGEST_SIDE):
+        raise DetectorError(
+            f"{source}: input {name} is {width} x {height}; sides of 32 to {_LARGEST_SIDE} can be "
+            "served"
+        )
+    kind = np.dtype(dtype)
+    if kind not in _INPUT_TYPES:
+        raise DetectorError(
+            f"{source}: input {name} is {kind}; export with float32, float16 or uint8 input"
+        )
+    return InputSpec(name, width, height, kind)
+
+
+def _literal(value: object) -> object:
+    """A Python literal out of text; anything that is not text stays; None where it is none."""
+    if not isinstance(value, str):
+        return value
+    if len(value) > _LONGEST_LITERAL:
+        return None
+    try:
+        return ast.literal_eval(value.strip())
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        return None
+
+
+def _is_true(value: object) -> bool:
+    return value is True or (isinstance(value, str) and value.strip().lower() == "true")
+
+
+def _names(value: object, source: str) -> tuple[str, ...]:
+    names = _literal(value)
+    if isinstance(names, Mapping):
+        try:
+            by_index = {int(key): name for key, name in names.items()}
+        except (TypeError, ValueError):
+            by_index = {}
+        names = [by_index.get(i) for i in range(len(names))]
+    if (
+        not isinstance(names, list | tuple)
+        or not names
+        or not all(isinstance(name, str) for name in names)
+    ):
+        raise DetectorError(
+            f"{source}: metadata `names` is not a list of class names numbered from 0; export again"
+        )
+    return tuple(str(name) for name in names)
+
+
+def _image_size(value: object) -> tuple[int, int] | None:
+    """Width and height out of `imgsz`, which is one side or [height, width]."""
+    sides = [value, value] if isinstance(value, int) else value
+    if not isinstance(sides, list | tuple) or len(sides) != 2:
+        return None
+    height, width = sides
+    if not isinstance(height, int) or not isinstance(width, int):
+        return None
+    return (width, height) if 0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE else None

@@ -1,0 +1,178 @@
+"""A picture onto the network's input: letterbox, channel order, scale; and boxes back again.
+
+    ultralytics   RGB / 255, picture centred, rest grey 114
+    yolox         BGR 0..255, picture top left, rest grey 114
+    yolox-legacy  RGB / 255 less ImageNet's mean over its deviation, top left (YOLOX before 0.1.1)
+
+The picture may have been decoded at a reduced scale; boxes are mapped with the full frame's size,
+so they land on full-frame pixels whatever the scale was.
+
+What it costs is one bilinear resize and one table look-up a channel, straight into the network's
+contiguous input: a byte has 256 values, so the table folds scale, mean and deviation, exactly. Only
+the picture's part is written; the grey rest stays from the frame before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.types import Float32Array, FloatArray, ImageArray
+
+Family = Literal["ultralytics", "yolox", "yolox-legacy"]
+FAMILIES: tuple[Family, ...] = get_args(Family)
+
+PAD = 114  #: grey of the letterbox, 0..255
+_IMAGENET_MEAN = (0.485, 0.456, 0.406)  #: red, green, blue, of RGB / 255
+_IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class Letterbox:
+    """Where a frame lies on the network's input, in whole pixels of the input.
+
+    The two axes have their own scale: the picture's part is rounded to whole pixels.
+    """
+
+    frame_width: int
+    frame_height: int
+    left: int
+    top: int
+    width: int  #: of the picture's part
+    height: int
+
+    @staticmethod
+    def fit(
+        frame_width: int, frame_height: int, size: tuple[int, int], family: Family
+    ) -> Letterbox:
+        """The largest fit of a frame into an input of `size` (width, height), aspect kept.
+
+        Raises `ValueError` for a frame or an input without area.
+        """
+        across, down = size
+        if min(frame_width, frame_height, across, down) < 1:
+            raise ValueError(
+                f"cannot letterbox {frame_width} x {frame_height} into {across} x {down}"
+            )
+        ratio = min(across / frame_width, down / frame_height)
+        wide, high = frame_width * ratio, frame_height * ratio
+        if family == "ultralytics":
+            width, height = round(wide), round(high)
+        else:  # YOLOX cuts; the slack keeps 1280 * (416 / 1280) from becoming 415
+            width, height = int(wide + 1e-6), int(high + 1e-6)
+        width, height = min(max(width, 1), across), min(max(height, 1), down)
+        centred = family == "ultralytics"
+        left, top = ((across - width) // 2, (down - height) // 2) if centred else (0, 0)
+        return Letterbox(frame_width, frame_height, left, top, width, height)
+
+    def forward(self, box: npt.NDArray[Any]) -> Float32Array:
+        """Boxes [n, 4] (x1, y1, x2, y2) from frame pixels to input pixels."""
+        sx, sy = self.width / self.frame_width, self.height / self.frame_height
+        scale = np.array([sx, sy, sx, sy])
+        moved: npt.NDArray[np.float64] = box * scale + np.array([self.left, self.top] * 2)
+        return moved.astype(np.float32)
+
+    def inverse(self, box: npt.NDArray[Any]) -> Float32Array:
+        """Boxes [n, 4] from input pixels to frame pixels; not clipped to the frame."""
+        sx, sy = self.frame_width / self.width, self.frame_height / self.height
+        moved: npt.NDArray[np.float64] = box - np.array([self.left, self.top] * 2, np.float64)
+        moved *= np.array([sx, sy, sx, sy])
+        return moved.astype(np.float32)
+
+
+class Preprocessor:
+    """Fills one network's input buffer, frame after frame. Not for several threads at once."""
+
+    def __init__(self, family: Family, buffer: npt.NDArray[Any]) -> None:
+        """`buffer` is the network's input, [1, 3, height, width], float32, float16 or uint8.
+
+        A uint8 input gets the bytes as they are: such a network scales them itself.
+        """
+        if buffer.ndim != 4 or buffer.shape[:2] != (1, 3) or not buffer.flags.c_contiguous:
+            raise ValueError(
+                f"expected a contiguous buffer [1, 3, height, width], got {buffer.shape}"
+            )
+        self.family = family
+        self.buffer = buffer
+        self.size = (int(buffer.shape[3]), int(buffer.shape[2]))
+        # Channel of the network -> channel of the picture, which is RGB.
+        self._source = (2, 1, 0) if family == "yolox" else (0, 1, 2)
+        self._tables = _tables(family, self._source, buffer.dtype)
+        # OpenCV has no look-up into half precision: its bits travel as 16-bit integers.
+        self._planes = buffer[0].view(np.int16) if buffer.dtype == np.float16 else buffer[0]
+        self._letterbox: Letterbox | None = None
+        self._picture: ImageArray = np.zeros((0, 0, 3), np.uint8)
+        self._channel: ImageArray = np.zeros((0, 0), np.uint8)
+
+    def letterbox(self, frame_width: int, frame_height: int) -> Letterbox:
+        """How a frame of this size lies on the input."""
+        last = self._letterbox
+        if last is not None and (last.frame_width, last.frame_height) == (
+            frame_width,
+            frame_height,
+        ):
+            return last
+        return Letterbox.fit(frame_width, frame_height, self.size, self.family)
+
+    def __call__(self, rgb: ImageArray, frame_width: int, frame_height: int) -> Letterbox:
+        """Writes `rgb` [h, w, 3] uint8, of any scale, into the buffer; returns where it lies.
+
+        Raises `ValueError` where `rgb` is no such picture or has another aspect than the frame.
+        """
+        _check_picture(rgb, frame_width, frame_height)
+        box = self.letterbox(frame_width, frame_height)
+        if box is not self._letterbox:
+            for plane, table in zip(self._planes, self._tables, strict=True):
+                plane[...] = table[PAD]
+            self._picture = np.empty((box.height, box.width, 3), np.uint8)
+            self._channel = np.empty((box.height, box.width), np.uint8)
+            self._letterbox = box
+        picture = rgb
+        if rgb.shape[:2] != (box.height, box.width):
+            cv2.resize(rgb, (box.width, box.height), dst=self._picture)
+            picture = self._picture
+        rows, columns = slice(box.top, box.top + box.height), slice(box.left, box.left + box.width)
+        for plane, table, source in zip(self._planes, self._tables, self._source, strict=True):
+            target = plane[rows, columns]
+            if target.dtype == np.uint8:
+                target[...] = picture[:, :, source]
+            else:
+                cv2.extractChannel(picture, source, dst=self._channel)
+                cv2.LUT(self._channel, table, dst=target)
+        return box
+
+
+def _tables(
+    family: Family, source: tuple[int, int, int], dtype: np.dtype[Any]
+) -> list[npt.NDArray[Any]]:
+    """For each channel of the network, what the input holds for every byte value, [256]."""
+    byte: FloatArray = np.arange(256, dtype=np.float64)
+    value: FloatArray
+    tables: list[npt.NDArray[Any]] = []
+    for channel in source:
+        if dtype == np.uint8 or family == "yolox":
+            value = byte
+        elif family == "ultralytics":
+            value = byte / 255
+        else:
+            value = (byte / 255 - _IMAGENET_MEAN[channel]) / _IMAGENET_DEVIATION[channel]
+        table = value.astype(dtype)
+        tables.append(table.view(np.int16) if dtype == np.float16 else table)
+    return tables
+
+
+def _check_picture(rgb: ImageArray, frame_width: int, frame_height: int) -> None:
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
+        raise ValueError(
+            f"expected a picture [height, width, 3] uint8, got {rgb.shape} {rgb.dtype}"
+        )
+    height, width = rgb.shape[:2]
+    # A reduced decode rounds each side up to a whole pixel; more than that is another picture.
+    if abs(width * frame_height - height * frame_width) > 2 * max(frame_width, frame_height):
+        raise ValueError(
+            f"a picture of {width} x {height} is not a scaled {frame_width} x {frame_height} frame"
+        )

@@ -1,0 +1,139 @@
+"""Letterbox and scaling: every family against a plain formula, and boxes there and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bikeped.detection.preprocess import FAMILIES, Letterbox, Preprocessor
+
+MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+
+
+def picture(height, width, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def formula(rgb, family):
+    """What the input holds for a picture, by the definition: [3, h, w] float64."""
+    if family == "ultralytics":
+        value = rgb / 255
+    elif family == "yolox":
+        value = rgb[:, :, ::-1].astype(np.float64)
+    else:
+        value = (rgb / 255 - MEAN) / DEVIATION
+    return value.transpose(2, 0, 1)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_values_are_the_formulas_where_nothing_is_resized(family, dtype):
+    rgb = picture(64, 96)
+    run = Preprocessor(family, np.zeros((1, 3, 96, 96), dtype))
+    box = run(rgb, 96, 64)
+    top = 16 if family == "ultralytics" else 0
+    assert (box.left, box.top, box.width, box.height) == (0, top, 96, 64)
+    canvas = np.full((96, 96, 3), 114, np.uint8)
+    canvas[top : top + 64] = rgb
+    expected = formula(canvas, family).astype(dtype)
+    np.testing.assert_array_equal(run.buffer[0], expected)
+
+
+@pytest.mark.parametrize(("family", "order"), [("ultralytics", 1), ("yolox", -1)])
+def test_a_byte_input_gets_the_bytes(family, order):
+    rgb = picture(32, 64)
+    run = Preprocessor(family, np.zeros((1, 3, 32, 64), np.uint8))
+    run(rgb, 64, 32)
+    np.testing.assert_array_equal(run.buffer[0], rgb[:, :, ::order].transpose(2, 0, 1))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_new_frame_size_leaves_nothing_of_the_old_one(family):
+    reused = Preprocessor(family, np.zeros((1, 3, 64, 64), np.float32))
+    reused(picture(64, 40, seed=1), 40, 64)
+    reused(picture(32, 64, seed=2), 64, 32)
+    fresh = Preprocessor(family, np.zeros((1, 3, 64, 64), np.float32))
+    fresh(picture(32, 64, seed=2), 64, 32)
+    np.testing.assert_array_equal(reused.buffer, fresh.buffer)
+
+
+def test_a_picture_that_is_a_view_of_another_serves_too():
+    whole = picture(40, 80)
+    cut = whole[4:36, 8:72]
+    a, b = (Preprocessor("yolox", np.zeros((1, 3, 64, 64), np.float32)) for _ in range(2))
+    a(cut, 64, 32)
+    b(np.ascontiguousarray(cut), 64, 32)
+    np.testing.assert_array_equal(a.buffer, b.buffer)
+
+
+def test_the_same_picture_at_half_scale_lies_in_the_same_place():
+    # A smooth picture: bright right half. The scale it was decoded at must not move the edge.
+    full = np.zeros((400, 800, 3), np.uint8)
+    full[:, 400:] = 200
+    run = Preprocessor("ultralytics", np.zeros((1, 3, 128, 128), np.float32))
+    where = run(full, 800, 400)
+    first = run.buffer.copy()
+    assert run(np.ascontiguousarray(full[::2, ::2]), 800, 400) == where
+    assert np.abs(run.buffer - first).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("family", "frame", "size", "place"),
+    [
+        ("ultralytics", (1920, 1080), (640, 640), (0, 140, 640, 360)),
+        ("ultralytics", (1080, 1920), (640, 640), (140, 0, 360, 640)),
+        ("ultralytics", (1920, 1080), (640, 384), (0, 12, 640, 360)),
+        ("ultralytics", (320, 320), (640, 640), (0, 0, 640, 640)),  # grown
+        ("yolox", (768, 432), (416, 416), (0, 0, 416, 234)),
+        ("yolox-legacy", (1000, 333), (416, 416), (0, 0, 416, 138)),  # 138.5 is cut
+        ("yolox", (1, 4000), (64, 64), (0, 0, 1, 64)),  # never less than a pixel
+    ],
+)
+def test_where_the_picture_lies(family, frame, size, place):
+    box = Letterbox.fit(*frame, size, family)
+    assert (box.left, box.top, box.width, box.height) == place
+
+
+@given(
+    st.sampled_from(FAMILIES),
+    st.tuples(st.integers(16, 8000), st.integers(16, 8000)),
+    st.tuples(st.integers(32, 1280), st.integers(32, 1280)),
+    st.lists(st.floats(0, 1), min_size=4, max_size=4),
+)
+def test_boxes_come_back(family, frame, size, share):
+    where = Letterbox.fit(*frame, size, family)
+    box = np.array([share], np.float64) * np.array([frame * 2])
+    inside = where.forward(box)
+    assert (inside >= -1e-3).all()
+    assert (inside <= np.array(size * 2) + 1e-3).all()
+    np.testing.assert_allclose(where.inverse(inside), box, atol=max(frame) * 2e-4)
+
+
+def test_the_corners_of_the_frame_are_the_corners_of_the_picture():
+    where = Letterbox.fit(3840, 2160, (640, 640), "ultralytics")
+    assert where.forward(np.array([[0, 0, 3840, 2160]])).tolist() == [[0, 140, 640, 500]]
+
+
+@pytest.mark.parametrize(
+    ("rgb", "frame"),
+    [
+        (np.zeros((32, 64), np.uint8), (64, 32)),
+        (np.zeros((32, 64, 4), np.uint8), (64, 32)),
+        (np.zeros((32, 64, 3), np.float32), (64, 32)),
+        (np.zeros((0, 64, 3), np.uint8), (64, 32)),
+        (np.zeros((64, 32, 3), np.uint8), (64, 32)),  # turned
+    ],
+)
+def test_what_is_not_the_frame_is_refused(rgb, frame):
+    run = Preprocessor("yolox", np.zeros((1, 3, 64, 64), np.float32))
+    with pytest.raises(ValueError, match="picture"):
+        run(rgb, *frame)
+
+
+def test_bad_buffers_and_sizes_are_refused():
+    with pytest.raises(ValueError, match="contiguous"):
+        Preprocessor("yolox", np.zeros((1, 64, 64, 3), np.float32))
+    with pytest.raises(ValueError, match="cannot letterbox"):
+        Letterbox.fit(0, 10, (64, 64), "yolox")
