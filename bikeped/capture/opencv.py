@@ -23,6 +23,7 @@ from bikeped.types import ImageArray
 # Codec tags that OpenCV's FFmpeg backend reports for Motion JPEG in AVI, MKV, MOV and MP4.
 JPEG_TAGS = frozenset({"MJPG", "mjpg", "jpeg", "JPEG", "AVRn"})
 MAX_FPS = 1000.0
+LOG_LEVEL_ERROR = 2  # OpenCV's
 
 
 class Capture(Protocol):
@@ -74,13 +75,15 @@ def quiet() -> Iterator[None]:
     FFmpeg's is read once, by the first capture of the process.
     """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.getLogLevel()
+    # The functions are in cv2 itself up to OpenCV 4, and in cv2.utils.logging from 5 on.
+    logging: Any = getattr(cv2.utils, "logging", cv2)
+    level = logging.getLogLevel()
     if "OPENCV_LOG_LEVEL" not in os.environ:
-        cv2.utils.logging.setLogLevel(min(level, cv2.utils.logging.LOG_LEVEL_ERROR))
+        logging.setLogLevel(min(level, LOG_LEVEL_ERROR))
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        logging.setLogLevel(level)
 
 
 class FfmpegReader:

@@ -310,6 +310,7 @@ async def test_a_paced_recording_runs_to_its_end_through_the_grabber(write_video
     frames = []
     while not grabber.ended or not frames or frames[-1] is not None:
         frames.append(await grabber.next(WAIT_S))
+        assert grabber.error is None
     assert grabber.stop(WAIT_S)
     numbers = [frame.number for frame in frames if frame is not None]
     assert numbers[-1] == 5
