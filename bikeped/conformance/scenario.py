@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from bikeped.errors import ScenarioError
-from bikeped.types import FloatArray
+from bikeped.types import BoolArray, FloatArray
 
 #: Length along the heading, width, height in metres (definitions, section 3).
 SIZES_M: dict[str, tuple[float, float, float]] = {
@@ -72,7 +72,7 @@ class Agent:
         xy, heading, present = self.sample(np.asarray([t]))
         return (xy[0], float(heading[0])) if present[0] else None
 
-    def sample(self, t: FloatArray) -> tuple[FloatArray, FloatArray, Any]:
+    def sample(self, t: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Positions [n, 2], headings [n] and presence [n] at times [n].
 
         The heading is the direction of the current path segment; where an agent stands still it

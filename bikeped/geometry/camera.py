@@ -109,6 +109,10 @@ class CameraPose:
         delta = np.asarray(xy_m, dtype=np.float64) - np.array([self.x_m, self.y_m])
         return np.asarray(delta @ self._axes().T)
 
+    def turn_to_ground(self, direction: npt.ArrayLike) -> FloatArray:
+        """World directions [..., 2] in the camera ground frame."""
+        return np.asarray(np.asarray(direction, dtype=np.float64) @ self._axes().T)
+
     def ground_to_world(self, xy_m: npt.ArrayLike) -> FloatArray:
         """Camera ground positions [..., 2] in the world."""
         turned: FloatArray = np.asarray(xy_m, dtype=np.float64) @ self._axes()

@@ -1,0 +1,206 @@
+"""A suite of scenarios through one camera: truth, perception and decisions, each made once."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.config import DecisionConfig, LoadedConfig, ground_camera, rule_settings
+from bikeped.conformance.metrics import Metrics, TruthFrames, measure
+from bikeped.conformance.perception import SIMULATION_POSE, Seen, see
+from bikeped.conformance.scenario import Scenario, dump_scenario
+from bikeped.conformance.simulate import Run, Scene, rows_of, states, track
+from bikeped.conformance.truth import Truth, TruthSettings, judge_truth
+from bikeped.geometry import CameraPose, GroundCamera
+
+_SELECTED = DecisionConfig()
+DEFAULT_TRUTH = TruthSettings()
+
+#: The configurations and rules that are compared (definitions, section 8).
+CONFIGURATIONS: dict[str, DecisionConfig] = {
+    "selected": _SELECTED,
+    "conservative": DecisionConfig(
+        memory_frames=60,
+        d_min_m=1.5,
+        d_max_m=15,
+        min_displacement_m=0.05,
+        lookback_frames=3,
+        speed_adaptive=False,
+    ),
+    "narrow": DecisionConfig(
+        memory_frames=0,
+        d_min_m=2.0,
+        d_max_m=10,
+        min_displacement_m=0.1,
+        lookback_frames=3,
+        speed_adaptive=False,
+    ),
+    "speed_adaptive": DecisionConfig(
+        memory_frames=60,
+        d_min_m=1.0,
+        d_max_m=20,
+        min_displacement_m=0.05,
+        lookback_frames=2,
+        speed_adaptive=True,
+    ),
+    "distance_only": DecisionConfig(
+        rule="distance", d_max_m=10, min_displacement_m=0, speed_adaptive=False
+    ),
+    "naive_closing": DecisionConfig(rule="naive"),
+    "ttc": DecisionConfig(rule="ttc", min_displacement_m=0),
+}
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Scenarios, the camera that watches them, and the thresholds of truth."""
+
+    scenarios: tuple[Scenario, ...]
+    camera: GroundCamera
+    pose: CameraPose = SIMULATION_POSE
+    truth_settings: TruthSettings = DEFAULT_TRUTH
+
+    @staticmethod
+    def load(scenarios: Sequence[Scenario], loaded: LoadedConfig) -> Suite:
+        return Suite(tuple(scenarios), ground_camera(loaded))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(s.name for s in self.scenarios)
+
+    @cached_property
+    def truths(self) -> tuple[Truth, ...]:
+        return tuple(judge_truth(s, self.truth_settings) for s in self.scenarios)
+
+    @cached_property
+    def truth_frames(self) -> TruthFrames:
+        return TruthFrames.join(self.truths)
+
+    @cached_property
+    def seen(self) -> tuple[Seen, ...]:
+        return tuple(see(s, self.camera, self.pose) for s in self.scenarios)
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 over the scenarios' contents, in order of name."""
+        digest = hashlib.sha256()
+        for scenario in sorted(self.scenarios, key=lambda s: s.name):
+            digest.update(dump_scenario(scenario).encode())
+        return digest.hexdigest()
+
+    def scenes(self, localisation_error: bool = True, delay_frames: int = 0) -> list[Scene]:
+        """Every scenario's detections without loss."""
+        return [
+            Scene(s.observed_m if localisation_error else s.true_m, s.present, s.kind, delay_frames)
+            for s in self.seen
+        ]
+
+    @cached_property
+    def run(self) -> Run:
+        """Track rows with localisation error, no loss, no latency."""
+        return self._both[0]
+
+    @cached_property
+    def run_without_error(self) -> Run:
+        return self._both[1]
+
+    @cached_property
+    def _both(self) -> tuple[Run, Run]:
+        """Both variants in one pass of the tracker, side by side."""
+        count = len(self.scenarios)
+        tracked = track([*self.scenes(True), *self.scenes(False)])
+        parts = []
+        for lanes in (slice(0, count), slice(count, 2 * count)):
+            part = replace(
+                tracked,
+                reported=tracked.reported[:, lanes],
+                id=tracked.id[:, lanes],
+                kind=tracked.kind[:, lanes],
+                xy_m=tracked.xy_m[:, lanes],
+                velocity_mps=tracked.velocity_mps[:, lanes],
+                acceleration_mps2=tracked.acceleration_mps2[:, lanes],
+                frames=tracked.frames[lanes],
+                delay_frames=tracked.delay_frames[lanes],
+            )
+            parts.append(rows_of(part))
+        return parts[0], parts[1]
+
+    def states(
+        self, decision: DecisionConfig, localisation_error: bool = True
+    ) -> npt.NDArray[np.int8]:
+        """State codes of every frame, scenario after scenario."""
+        run = self.run if localisation_error else self.run_without_error
+        return states(run, rule_settings(decision))
+
+    def measure(self, decision: DecisionConfig, localisation_error: bool = True) -> Metrics:
+        return measure(self.truth_frames, self.states(decision, localisation_error))
+
+    def with_truth(self, settings: TruthSettings) -> Suite:
+        """The same suite under other thresholds; perception is not computed again."""
+        other = replace(self, truth_settings=settings)
+        for name in ("seen", "_both", "hash"):
+            if name in self.__dict__:
+                other.__dict__[name] = self.__dict__[name]
+        return other
+
+
+def compare(
+    suite: Suite,
+    configurations: Mapping[str, DecisionConfig] = CONFIGURATIONS,
+) -> dict[str, dict[str, Metrics]]:
+    """Metrics of every configuration, with and without localisation error."""
+    return {
+        "configurations": {name: suite.measure(c) for name, c in configurations.items()},
+        "without_localisation_error": {
+            name: suite.measure(c, localisation_error=False) for name, c in configurations.items()
+        },
+    }
+
+
+def compare_json(
+    suite: Suite, results: Mapping[str, Mapping[str, Metrics]], loaded: LoadedConfig, seed: int = 0
+) -> dict[str, Any]:
+    """The documented JSON of `conformance compare`."""
+
+    def block(metrics: Metrics) -> dict[str, Any]:
+        return {
+            **metrics.as_dict(),
+            "by_scenario": {name: metrics.scenario_dict(i) for i, name in enumerate(suite.names)},
+        }
+
+    return {
+        "scenarios": len(suite.scenarios),
+        "suite_hash": suite.hash,
+        "camera": camera_json(suite),
+        "config_hash": loaded.hash,
+        "calibration_hash": loaded.calibration_hash,
+        "seed": seed,
+        **{
+            part: {name: block(metrics) for name, metrics in found.items()}
+            for part, found in results.items()
+        },
+    }
+
+
+def camera_json(suite: Suite) -> dict[str, Any]:
+    """The camera in words that a reader of the JSON can check."""
+    camera, pose = suite.camera, suite.pose
+    return {
+        "projection": camera.lens.projection,
+        "focal_length_px": camera.lens.focal_px,
+        "k": list(camera.lens.k),
+        "fov_deg": float(np.degrees(2 * camera.lens.max_theta_rad)),
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "height_m": camera.height_m,
+        "pitch_deg": camera.pitch_deg,
+        "x_m": pose.x_m,
+        "y_m": pose.y_m,
+        "heading_deg": pose.heading_deg,
+    }

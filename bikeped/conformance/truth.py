@@ -1,0 +1,259 @@
+"""Kinematic ground truth: which frames are dangerous, and can a warning still help? Pure.
+
+Definitions, section 5; paper, section 4.2. Positions come from the scenario's script, so truth
+knows the future that the pole does not: each frame looks 5 s ahead along the scripted paths.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bikeped.conformance.scenario import Agent, Scenario
+from bikeped.types import BoolArray, FloatArray, IntArray, Kind
+
+#: Distracted pedestrian's perception-reaction time, s (paper, section 4.5).
+PEDESTRIAN_PRT_S = 1.87
+ATTENTIVE_PRT_S = 0.84
+SAMPLE_S = 0.05
+LOOK_AHEAD_S = 5.0
+PAIR_RANGE_M = 25.0
+CONTACT_M = 1.0
+CLEARANCE_WAY_M = 2.0
+CLEARANCE_STANDING_S = 30.0
+STANDING_MPS = 0.1
+CLOSING_MIN_MPS = 0.3
+SEVERITY_SPEED_MPS = 12.0
+CPA_SLACK_M = 0.05
+
+#: Frames (1/30 s) and look-ahead samples (1/20 s) both lie on a grid of 1/60 s.
+_GRID_HZ = 60
+_FRAME_STRIDE = 2
+_SAMPLE_STRIDE = 3
+_SAMPLES = round(LOOK_AHEAD_S / SAMPLE_S)
+_EPSILON = 1e-9
+
+KIND_OF: dict[str, Kind] = {
+    "pedestrian": Kind.PEDESTRIAN,
+    "cyclist": Kind.CYCLIST,
+    "motorcycle": Kind.CYCLIST,
+    "car": Kind.VEHICLE,
+    "bus": Kind.VEHICLE,
+    "truck": Kind.VEHICLE,
+}
+
+
+@dataclass(frozen=True)
+class Braking:
+    """A cyclist's reaction time (s) and deceleration (m/s^2)."""
+
+    reaction_s: float
+    deceleration_mps2: float
+
+
+BRAKING: dict[str, Braking] = {
+    "bicycle": Braking(0.84, 1.96),
+    "ebike": Braking(0.84, 6.0),
+    "aashto": Braking(2.5, 3.4),
+}
+
+
+@dataclass(frozen=True)
+class TruthSettings:
+    """The three free thresholds, and the braking profile (None: by the scenario's vehicle).
+
+    `ttc_bound_s` None is the definition's 1.87 s + the pedestrian's clearance time.
+    """
+
+    cpa_radius_m: float = 5.0
+    stopping_margin: float = 0.8
+    ttc_bound_s: float | None = None
+    braking: str | None = None
+
+    def braking_of(self, scenario: Scenario) -> Braking:
+        return BRAKING[self.braking or scenario.vehicle]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of one scenario, arrays over its frames [f].
+
+    `ttc_s` and `budget_s` may be infinite. `cyclist` and `pedestrian` are ids of the frame's pair,
+    -1 where there is none within range. `distance_m` is that pair's distance; `nearest_m` the
+    smallest distance of any pair, at any range.
+    """
+
+    time_s: FloatArray
+    danger: BoolArray
+    actionable: BoolArray
+    severity: FloatArray
+    ttc_s: FloatArray
+    d_min_m: FloatArray
+    budget_s: FloatArray
+    distance_m: FloatArray
+    cyclist: IntArray
+    pedestrian: IntArray
+    nearest_m: FloatArray
+
+    @property
+    def imminent(self) -> BoolArray:
+        """Danger in which a warning comes too late to be acted upon."""
+        return np.asarray(self.danger & ~self.actionable)
+
+
+def judge_truth(scenario: Scenario, settings: TruthSettings = TruthSettings()) -> Truth:
+    """The ground truth of every frame of a scenario."""
+    time_s = scenario.frame_times()
+    frames = len(time_s)
+    grid_s = np.arange(_FRAME_STRIDE * (frames - 1) + _SAMPLE_STRIDE * _SAMPLES + 1) / _GRID_HZ
+    cyclists = [a for a in scenario.agents if KIND_OF[a.kind] is Kind.CYCLIST]
+    pedestrians = [a for a in scenario.agents if KIND_OF[a.kind] is Kind.PEDESTRIAN]
+    paths = {a.id: a.sample(grid_s)[0] for a in (*cyclists, *pedestrians)}
+    best = _Best(frames)
+    nearest = np.full(frames, np.inf)
+    for cyclist in cyclists:
+        for pedestrian in pedestrians:
+            pair = _pair(
+                cyclist,
+                pedestrian,
+                paths[cyclist.id],
+                paths[pedestrian.id],
+                frames,
+                settings,
+                settings.braking_of(scenario),
+            )
+            best.take(pair, cyclist.id, pedestrian.id)
+            nearest = np.fmin(nearest, pair.distance)
+    return Truth(
+        time_s=time_s,
+        danger=best.danger,
+        actionable=best.danger & (best.ttc >= PEDESTRIAN_PRT_S - _EPSILON),
+        severity=np.where(best.danger, best.severity, 0.0),
+        ttc_s=best.ttc,
+        d_min_m=best.d_min,
+        budget_s=best.budget,
+        distance_m=best.distance,
+        cyclist=best.cyclist,
+        pedestrian=best.pedestrian,
+        nearest_m=nearest,
+    )
+
+
+def severity_of(speed_mps: FloatArray) -> FloatArray:
+    """Kinetic energy against that at 12 m/s, at most 1."""
+    return np.asarray(np.minimum((speed_mps / SEVERITY_SPEED_MPS) ** 2, 1.0))
+
+
+@dataclass(frozen=True)
+class _PairTruth:
+    """One pair over the frames; `considered` where both exist within range."""
+
+    considered: BoolArray
+    danger: BoolArray
+    severity: FloatArray
+    ttc: FloatArray
+    d_min: FloatArray
+    budget: FloatArray
+    distance: FloatArray
+
+
+def _pair(
+    cyclist: Agent,
+    pedestrian: Agent,
+    cyclist_xy: FloatArray,
+    pedestrian_xy: FloatArray,
+    frames: int,
+    settings: TruthSettings,
+    braking: Braking,
+) -> _PairTruth:
+    frame = _FRAME_STRIDE * np.arange(frames)
+    gap = cyclist_xy - pedestrian_xy
+    distance = np.sqrt((gap**2).sum(-1))  # NaN where either does not exist
+    ahead_of = np.where(np.isnan(distance), np.inf, distance)
+    # Lives are intervals, so what does not exist any more never exists again: infinity is enough.
+    ahead = ahead_of[frame[:, None] + _SAMPLE_STRIDE * np.arange(_SAMPLES)]
+    now = distance[frame]
+    considered = now <= PAIR_RANGE_M
+    later = distance[frame + _SAMPLE_STRIDE]
+    closing = np.nan_to_num((now - later) / SAMPLE_S, nan=0.0)
+    d_min = ahead.min(axis=1)
+    contact = ahead < CONTACT_M
+    ttc = np.where(contact.any(axis=1), contact.argmax(axis=1) * SAMPLE_S, np.inf)
+    near_cpa = ahead <= d_min[:, None] + CPA_SLACK_M
+    budget = np.where(np.isfinite(d_min), near_cpa.argmax(axis=1) * SAMPLE_S, np.inf)
+    cyclist_speed = _speed(cyclist_xy, frame)
+    pedestrian_speed = _speed(pedestrian_xy, frame)
+    stopping = cyclist_speed * braking.reaction_s + cyclist_speed**2 / (
+        2 * braking.deceleration_mps2
+    )
+    free = np.maximum(np.nan_to_num(now, nan=np.inf) - CONTACT_M, 0.0)
+    if settings.ttc_bound_s is None:
+        clearance = np.where(
+            pedestrian_speed < STANDING_MPS,
+            CLEARANCE_STANDING_S,
+            CLEARANCE_WAY_M / np.maximum(pedestrian_speed, STANDING_MPS),
+        )
+        bound: FloatArray = PEDESTRIAN_PRT_S + clearance
+    else:
+        bound = np.full(frames, settings.ttc_bound_s)
+    danger = (
+        considered
+        & (closing > CLOSING_MIN_MPS)
+        & (d_min < settings.cpa_radius_m)
+        & ((stopping > settings.stopping_margin * free) | (ttc < bound))
+    )
+    return _PairTruth(
+        considered=considered,
+        danger=danger,
+        severity=severity_of(cyclist_speed),
+        ttc=ttc,
+        d_min=d_min,
+        budget=budget,
+        distance=now,
+    )
+
+
+def _speed(xy: FloatArray, frame: IntArray) -> FloatArray:
+    """Forward difference over 0.05 s; 0 where either end does not exist."""
+    step = xy[frame + _SAMPLE_STRIDE] - xy[frame]
+    return np.asarray(np.nan_to_num(np.sqrt((step**2).sum(-1)) / SAMPLE_S, nan=0.0))
+
+
+class _Best:
+    """The pair that a frame takes: in danger with the highest severity, else the smallest d_min.
+
+    Pairs are offered in agent order, and only a better one replaces: the first wins a tie.
+    """
+
+    def __init__(self, frames: int) -> None:
+        self.danger: BoolArray = np.zeros(frames, np.bool_)
+        self.severity: FloatArray = np.zeros(frames)
+        self.ttc: FloatArray = np.full(frames, np.inf)
+        self.d_min: FloatArray = np.full(frames, np.inf)
+        self.budget: FloatArray = np.full(frames, np.inf)
+        self.distance: FloatArray = np.full(frames, np.inf)
+        self.cyclist: IntArray = np.full(frames, -1, np.int64)
+        self.pedestrian: IntArray = np.full(frames, -1, np.int64)
+
+    def take(self, pair: _PairTruth, cyclist: int, pedestrian: int) -> None:
+        none_yet = self.cyclist < 0
+        worse_danger = pair.danger & (~self.danger | (pair.severity > self.severity))
+        nearer = ~pair.danger & ~self.danger & (none_yet | (pair.d_min < self.d_min))
+        at = pair.considered & (worse_danger | nearer)
+        self.danger[at] = pair.danger[at]
+        self.severity[at] = pair.severity[at]
+        self.ttc[at] = pair.ttc[at]
+        self.d_min[at] = pair.d_min[at]
+        self.budget[at] = pair.budget[at]
+        self.distance[at] = pair.distance[at]
+        self.cyclist[at] = cyclist
+        self.pedestrian[at] = pedestrian
+
+
+def with_ttc_bound(settings: TruthSettings, seconds: float) -> TruthSettings:
+    """The same thresholds with a fixed TTC bound."""
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"ttc bound: expected seconds above 0, got {seconds}")
+    return replace(settings, ttc_bound_s=seconds)
