@@ -260,8 +260,9 @@ class TrackingConfig(_Section, frozen=True):
         Meta(
             gt=0,
             le=1,
-            description="weight of the newest step in the smoothed velocity, per nominal frame; the "
-            "paper's simulation has 0.5, with which the noise of real boxes throws lost tracks far",
+            description="weight of the newest step in the smoothed velocity, per nominal frame; "
+            "the paper's simulation has 0.5, with which the noise of real boxes throws lost tracks "
+            "far",
         ),
     ] = 0.2
     speed_window_frames: Annotated[

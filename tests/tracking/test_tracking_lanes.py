@@ -1,0 +1,326 @@
+"""The life of a track, step by step, and lanes side by side."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bikeped.tracking import LaneTracker, TrackerSettings
+
+PEDESTRIAN, CYCLIST, VEHICLE = 0, 1, 2
+#: As the pole's configuration has it.
+POLE = TrackerSettings(
+    match_radius_m=3.0,
+    max_unseen_s=10.0,
+    velocity_weight=0.2,
+    frame_s=1 / 30,
+    confirm_hits=2,
+    max_speed_mps=(6.0, 20.0, 40.0),
+    position_noise_m=0.75,
+    unbiased=True,
+    max_range_m=60.0,
+)
+
+
+def feed(tracker, t, *points, kind=PEDESTRIAN):
+    """One lane, one frame; `points` are (x, y) or (x, y, kind)."""
+    xy = np.array([p[:2] for p in points], np.float64).reshape(1, -1, 2)
+    kinds = np.array([[p[2] if len(p) > 2 else kind for p in points]], np.int8)
+    tracker.update(t, xy, kinds.reshape(1, -1))
+
+
+def present(tracker):
+    """{id: (x, y)} of the reported tracks."""
+    slots = np.nonzero(tracker.reported[0])[0]
+    return {int(tracker.id[0, s]): tuple(tracker.xy_m[0, s].tolist()) for s in slots}
+
+
+def slot_of(tracker, number):
+    return int(np.nonzero(tracker.alive[0] & (tracker.id[0] == number))[0][0])
+
+
+# ---- the pole's tracker: birth, confirmation, coasting, return, end
+
+
+def test_birth_and_confirmation():
+    tracker = LaneTracker(POLE)
+    feed(tracker, 0.0, (5, 0))
+    assert present(tracker) == {}
+    assert tracker.alive.sum() == 1
+    feed(tracker, 1 / 30, (5, 0.01))
+    assert present(tracker) == {1: (5, 0.01)}
+    assert tracker.detection[0, slot_of(tracker, 1)] == 0
+
+
+def test_a_single_false_detection_never_counts_and_is_soon_forgotten():
+    tracker = LaneTracker(POLE)
+    feed(tracker, 0.0, (5, 0))
+    for i in range(1, 7):
+        feed(tracker, i / 30)
+        assert tracker.alive.sum() == 1
+        assert present(tracker) == {}
+    feed(tracker, 7 / 30)  # 0.2 s have passed
+    assert tracker.alive.sum() == 0
+
+
+def test_a_lost_track_coasts_at_its_velocity_and_is_found_again():
+    tracker = LaneTracker(POLE)
+    for i in range(31):
+        feed(tracker, i / 30, (5, 5 * i / 30), kind=CYCLIST)
+    for i in range(31, 61):
+        feed(tracker, i / 30)
+        assert present(tracker)[1] == pytest.approx((5, 5 * i / 30), abs=1e-9)
+        assert tracker.detection[0, slot_of(tracker, 1)] == -1
+    feed(tracker, 61 / 30, (5.3, 5 * 61 / 30), kind=CYCLIST)
+    assert present(tracker) == {1: (5.3, 5 * 61 / 30)}
+
+
+def test_dropped_after_10_seconds_and_not_before():
+    tracker = LaneTracker(POLE)
+    feed(tracker, 0.0, (5, 0))
+    feed(tracker, 1 / 30, (5, 0))
+    for i in range(2, 302):
+        feed(tracker, i / 30)
+        assert 1 in present(tracker), i
+    feed(tracker, 302 / 30)
+    assert present(tracker) == {}
+    feed(tracker, 303 / 30, (5, 0))
+    feed(tracker, 304 / 30, (5, 0))
+    assert set(present(tracker)) == {2}  # ids are never used again
+
+
+def test_a_track_that_coasts_out_of_range_is_dropped():
+    tracker = LaneTracker(POLE)
+    for i in range(30):
+        feed(tracker, i / 30, (50 + 10 * i / 30, 0), kind=CYCLIST)
+    assert present(tracker)
+    feed(tracker, 31 / 30)
+    assert not present(tracker)
+
+
+@pytest.mark.parametrize("settings", [POLE, TrackerSettings()])
+def test_no_match_across_classes(settings):
+    tracker = LaneTracker(settings)
+    feed(tracker, 0.0, (5, 0, PEDESTRIAN))
+    feed(tracker, 1 / 30, (5, 0, PEDESTRIAN))
+    feed(tracker, 2 / 30, (5, 0, CYCLIST))
+    feed(tracker, 3 / 30, (5, 0, CYCLIST))
+    assert set(present(tracker)) == {1, 2}
+    kinds = tracker.kind[0][tracker.reported[0]]
+    assert sorted(kinds.tolist()) == [PEDESTRIAN, CYCLIST]
+
+
+# ---- the speed gate
+
+
+def test_the_gate_refuses_a_jump_but_does_not_breed():
+    tracker = LaneTracker(POLE)
+    for i in range(5):
+        feed(tracker, i / 30, (5, 0))
+    # 6 m/s * 1/30 s + 0.75 m = 0.95 m: 1.0 m is too far for one frame, but no second person.
+    feed(tracker, 5 / 30, (5, 1.0))
+    assert tracker.alive.sum() == 1
+    assert tracker.detection[0, 0] == -1
+    # A frame later 6 * 2/30 + 0.75 = 1.15 m are allowed, and it is the same track.
+    feed(tracker, 6 / 30, (5, 1.0))
+    assert present(tracker) == {1: (5, 1.0)}
+    assert tracker.alive.sum() == 1
+
+
+def test_a_detection_beside_a_track_that_has_its_own_is_a_new_one():
+    tracker = LaneTracker(POLE)
+    feed(tracker, 0.0, (5, 0))
+    feed(tracker, 1 / 30, (5, 0), (5, 1.2))
+    feed(tracker, 2 / 30, (5, 0), (5, 1.2))
+    assert present(tracker) == {1: (5, 0), 2: (5, 1.2)}
+
+
+def test_the_gate_knows_the_class():
+    for kind, far_enough in ((PEDESTRIAN, 0.9), (CYCLIST, 1.4), (VEHICLE, 2.0)):
+        tracker = LaneTracker(POLE)
+        feed(tracker, 0.0, (5, 0), kind=kind)
+        feed(tracker, 1 / 30, (5, far_enough), kind=kind)
+        assert tracker.hits[0, 0] == 2
+        tracker = LaneTracker(POLE)
+        feed(tracker, 0.0, (5, 0), kind=kind)
+        feed(tracker, 1 / 30, (5, far_enough + 0.1), kind=kind)
+        assert tracker.hits[0, 0] == 1  # 6, 20 or 40 m/s * 1/30 s + 0.75 m
+
+
+def test_no_velocity_beyond_the_classs_speed():
+    tracker = LaneTracker(POLE)
+    feed(tracker, 0.0, (5, 0))
+    feed(tracker, 1 / 30, (5, 0.9))  # 27 m/s in one step
+    assert np.hypot(*tracker.velocity_mps[0, 0]) == pytest.approx(6.0)
+
+
+def test_farther_than_the_match_radius_is_somebody_else():
+    for settings in (POLE, TrackerSettings()):
+        tracker = LaneTracker(settings)
+        feed(tracker, 0.0, (5, 0))
+        feed(tracker, 1 / 30, (5, 3.01))
+        assert tracker.alive.sum() == 2
+    tracker = LaneTracker(TrackerSettings())
+    feed(tracker, 0.0, (5, 0))
+    feed(tracker, 1 / 30, (5, 3.0))  # at the radius it still is the same
+    assert tracker.alive.sum() == 1
+
+
+# ---- time
+
+
+def test_dropped_frames_do_not_change_velocity_or_position():
+    every, third = LaneTracker(POLE), LaneTracker(POLE)
+    for i in range(61):
+        feed(every, i / 30, (5, 0.1 * i), kind=CYCLIST)
+        if i % 3 == 0:
+            feed(third, i / 30, (5, 0.1 * i), kind=CYCLIST)
+    assert present(every)[1] == pytest.approx(present(third)[1])
+    np.testing.assert_allclose(every.velocity_mps[0, 0], (0, 3), atol=1e-9)
+    np.testing.assert_allclose(third.velocity_mps[0, 0], (0, 3), atol=1e-9)
+
+
+def test_the_memory_of_the_smoothed_velocity_is_in_seconds():
+    # At rest until 1 s, then 4 m/s: after n nominal frames 0.8^n of rest remains, however many
+    # frames carried it.
+    for gap in (1, 2, 5):
+        tracker = LaneTracker(replace(POLE, velocity_weight=0.2))
+        for i in range(31):
+            feed(tracker, i / 30, (5, 0), kind=CYCLIST)
+        for i in range(30 + gap, 41, gap):
+            feed(tracker, i / 30, (5, 4 * (i - 30) / 30), kind=CYCLIST)
+        assert tracker.velocity_mps[0, 0, 1] == pytest.approx(4 * (1 - 0.8**10), abs=1e-9)
+
+
+def test_irregular_times():
+    rng = np.random.default_rng(1)
+    t, tracker = 0.0, LaneTracker(POLE)
+    for _ in range(200):
+        t += rng.choice([0.005, 1 / 30, 0.05, 0.2, 0.9])
+        feed(tracker, t, (5 + 2 * t / 50, -20 + 0.5 * t))
+    assert set(present(tracker)) == {1}
+    np.testing.assert_allclose(tracker.velocity_mps[0, 0], (0.04, 0.5), atol=1e-6)
+
+
+def test_time_must_not_go_back():
+    tracker = LaneTracker(POLE)
+    feed(tracker, 1.0)
+    with pytest.raises(ValueError, match=r"0\.9 is before the last update at 1\.0"):
+        feed(tracker, 0.9)
+
+
+# ---- the simulation's settings (definitions, section 7)
+
+
+def test_simulation_reports_from_the_first_detection():
+    tracker = LaneTracker(TrackerSettings())
+    feed(tracker, 0.0, (5, 0))
+    assert present(tracker) == {1: (5, 0)}
+
+
+def test_simulation_velocity_and_acceleration_are_exponential_means_from_zero():
+    tracker = LaneTracker(TrackerSettings())
+    ys = [0.0, 0.3, 0.5, 0.9, 0.8, 1.6]
+    velocity = acceleration = 0.0  # per frame, as the simulation counts
+    for i, y in enumerate(ys):
+        feed(tracker, i / 30, (5, y))
+        if i:
+            before = velocity
+            velocity = 0.5 * velocity + 0.5 * (y - ys[i - 1])
+            acceleration = 0.5 * acceleration + 0.5 * (velocity - before)
+        assert tracker.velocity_mps[0, 0, 1] / 30 == pytest.approx(velocity, abs=1e-9)
+        assert tracker.acceleration_mps2[0, 0, 1] / 900 == pytest.approx(acceleration, abs=1e-9)
+
+
+def test_simulation_has_no_speed_gate():
+    tracker = LaneTracker(TrackerSettings())
+    feed(tracker, 0.0, (5, 0))
+    feed(tracker, 1 / 30, (5, 2.9))
+    assert present(tracker) == {1: (5, 2.9)}
+
+
+def test_simulation_removes_after_more_than_30_unseen_frames():
+    for start in (0, 7, 1000):  # i / 30 rounds differently everywhere
+        tracker = LaneTracker(TrackerSettings())
+        feed(tracker, start / 30, (5, 0))
+        for i in range(1, 31):
+            feed(tracker, (start + i) / 30)
+            assert present(tracker) == {1: (5, 0)}
+        feed(tracker, (start + 31) / 30)
+        assert present(tracker) == {}
+
+
+def test_simulation_keeps_a_track_that_returns_after_30_unseen_frames():
+    tracker = LaneTracker(TrackerSettings())
+    feed(tracker, 0.0, (5, 0))
+    for i in range(1, 31):
+        feed(tracker, i / 30)
+    feed(tracker, 31 / 30, (5, 0.5))
+    assert present(tracker) == {1: (5, 0.5)}
+
+
+# ---- ten people standing
+
+
+def crowd(seed, spacing, miss, layout):
+    """Tracker after each of 300 frames of ten people standing, boxes 10 cm uncertain."""
+    rng = np.random.default_rng(seed)
+    place = np.arange(10)
+    if layout == "row":
+        people = np.stack([np.full(10, 8.0), place * spacing - 4], axis=1)
+    else:
+        people = np.stack([8 + place // 5 * spacing, place % 5 * spacing - 4], axis=1)
+    tracker = LaneTracker(POLE)
+    for frame in range(300):
+        xy = people + rng.normal(0, 0.1, people.shape)
+        xy = rng.permutation(xy[rng.random(10) >= miss])
+        tracker.update(frame / 30, xy[None], np.zeros((1, len(xy)), np.int8))
+        yield frame, tracker
+
+
+@pytest.mark.parametrize("layout", ["row", "two rows"])
+@pytest.mark.parametrize("spacing", [0.8, 1.0, 1.5, 2.0])
+def test_ten_people_standing_stay_ten_tracks(spacing, layout):
+    for seed in range(3):
+        for frame, tracker in crowd(seed, spacing, 0.0, layout):
+            ids = sorted(present(tracker))
+            assert ids == (list(range(1, 11)) if frame else [])
+        assert tracker.alive.sum() == 10
+
+
+@pytest.mark.parametrize("layout", ["row", "two rows"])
+@pytest.mark.parametrize("spacing", [1.0, 1.5, 2.0])
+def test_ten_people_of_whom_a_quarter_is_missed_never_become_eleven(spacing, layout):
+    for seed in range(3):
+        most = max(int(tracker.reported.sum()) for _, tracker in crowd(seed, spacing, 0.25, layout))
+        assert most == 10
+
+
+# ---- lanes
+
+
+@pytest.mark.parametrize("settings", [POLE, TrackerSettings()])
+def test_lanes_together_equal_each_alone(settings):
+    rng = np.random.default_rng(3)
+    lanes, places = 5, 12
+    together = LaneTracker(settings, lanes, slots=2)
+    alone = [LaneTracker(settings, 1, slots=2) for _ in range(lanes)]
+    home = rng.uniform(-10, 10, (lanes, places, 2))
+    kind_of = rng.integers(0, 3, (lanes, places)).astype(np.int8)
+    for frame in range(80):
+        xy = home + rng.normal(0, 0.15, home.shape) + np.array([0.03, 0.02]) * frame
+        here = rng.random((lanes, places)) < np.array([0.2, 0.5, 0.7, 0.9, 1.0])[:, None]
+        kind = np.where(here, kind_of, -1).astype(np.int8)
+        xy[~here] = np.where(rng.random(2) < 0.5, np.nan, 3.0)  # empty places hold anything
+        together.update(frame / 30, xy, kind)
+        for lane, single in enumerate(alone):
+            single.update(frame / 30, xy[lane : lane + 1], kind[lane : lane + 1])
+            slots = single.alive.shape[1]
+            assert not together.alive[lane, slots:].any()
+            a, b = together.alive[lane, :slots], single.alive[0]
+            assert (a == b).all()
+            for name in ("id", "kind", "xy_m", "velocity_mps", "acceleration_mps2", "seen_s",
+                         "hits", "detection"):  # fmt: skip
+                left, right = getattr(together, name)[lane, :slots], getattr(single, name)[0]
+                assert (left[a] == right[b]).all(), (frame, lane, name)
+    assert together.id.max() > 12
