@@ -1,0 +1,96 @@
+"""The figures: every one measured beside the obvious way of doing the same, in one run.
+
+`scripts/bench` runs all, `scripts/bench table nms` some; `--json FILE` keeps the figures. Ours and
+the obvious way take turns (A B A B ...), so that a machine that changes its speed changes both; the
+median of each and the median of the ratios are shown. Nothing here is asserted: the tests hold
+what must hold, this shows how fast it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+# The obvious ways would otherwise spread over both cores and hide what they cost.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+
+@dataclass
+class Figures:
+    """Rows of one benchmark: what, ours, the obvious way, unit, goal."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, what: str, ours: float, obvious: float | None, unit: str, goal: str = "") -> None:
+        """One row; the ratio is ours over the obvious."""
+        ratio = ours / obvious if obvious else None
+        self.rows.append(
+            {
+                "what": what,
+                "ours": ours,
+                "obvious": obvious,
+                "unit": unit,
+                "ratio": ratio,
+                "goal": goal,
+            }
+        )
+        shown = f"{obvious:12.3f}" if obvious is not None else " " * 12
+        share = f"{ratio:8.3f}" if ratio is not None else " " * 8
+        print(f"{what:<62}{ours:12.3f}{shown}{share}  {unit:<9}{goal}", flush=True)
+
+
+def in_turns(
+    ours: Callable[[], object], obvious: Callable[[], object], runs: int = 7
+) -> tuple[float, float]:
+    """Median seconds of both, measured in turns after one warm-up each."""
+    ours()
+    obvious()
+    times: tuple[list[float], list[float]] = ([], [])
+    for _ in range(runs):
+        for way, kept in ((ours, times[0]), (obvious, times[1])):
+            began = time.perf_counter()
+            way()
+            kept.append(time.perf_counter() - began)
+    return statistics.median(times[0]), statistics.median(times[1])
+
+
+def main() -> int:
+    from benchmarks import conformance, detection, loop, table, tracking
+
+    known: dict[str, Callable[[Figures], None]] = {
+        "table": table.run,
+        "frame": detection.frame,
+        "nms": detection.nms,
+        "tracking": tracking.run,
+        "loop": loop.run,
+        "conformance": conformance.run,
+    }
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="BENCHMARK", help=", ".join(known))
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.names if name not in known]
+    if unknown:
+        parser.error(f"unknown benchmark {unknown[0]}; known are {', '.join(known)}")
+    figures = Figures()
+    print(f"{'what':<62}{'ours':>12}{'obvious':>12}{'ratio':>8}  {'unit':<9}goal")
+    for name in arguments.names or known:
+        known[name](figures)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures.rows, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
