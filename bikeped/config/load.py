@@ -18,7 +18,8 @@ from bikeped.config.sections import Config
 from bikeped.errors import ConfigError
 
 _MAX_BYTES = 1_000_000
-_MAX_NODES = 100_000
+_MAX_NODES = 20_000
+_MAX_DEPTH = 20
 #: What PyYAML raises beside YAMLError, on odd numbers, dates and explicit tags (`!!int ''`).
 _YAML_TROUBLE = (
     ValueError,
@@ -121,17 +122,9 @@ def config_hash(config: Config, calibration_hash: str | None = None) -> str:
 
 def _yaml_mapping(text: str, source: str) -> dict[str, Any]:
     try:
-        data = _load_yaml(text, source)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark is not None else ""
-        what = getattr(error, "problem", None) or "cannot be read"
-        raise ConfigError(
-            f"{source}{where}: is not YAML ({what}); check the indentation"
-        ) from error
-    except _YAML_TROUBLE as error:
-        what = _one_line(str(error))
-        raise ConfigError(f"{source}: is not a usable YAML value ({what}); simplify it") from error
+        data = load_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{source}: {error}; correct it there") from error
     if data is None:
         return {}
     if not isinstance(data, dict):
@@ -139,8 +132,35 @@ def _yaml_mapping(text: str, source: str) -> dict[str, Any]:
     return data
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """PyYAML keeps the last of two equal keys; a section that is not heeded must not go unseen."""
+class StrictLoader(yaml.SafeLoader):
+    """YAML as people's files need it: everything that would be misunderstood is an error.
+
+    No aliases (a few lines of them can stand for gigabytes), no endless nesting, only characters
+    that files and paths can hold, and each key once: PyYAML keeps the last of two equal keys, and a
+    section that is not heeded must not go unseen.
+    """
+
+    _depth = 0
+    _nodes = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
+        self._nodes += 1
+        if isinstance(event, yaml.AliasEvent):
+            problem = "aliases are not allowed, write the value out"
+        elif self._depth >= _MAX_DEPTH:
+            problem = "nested too deeply"
+        elif self._nodes > _MAX_NODES:
+            problem = "too many values"
+        elif isinstance(event, yaml.ScalarEvent) and _UNUSABLE.search(event.value):
+            problem = "a character that no text can hold"
+        else:
+            self._depth += 1
+            node: yaml.Node | None = super().compose_node(parent, index)
+            self._depth -= 1
+            return node
+        mark: Any = event.start_mark
+        raise yaml.constructor.ConstructorError(problem=problem, problem_mark=mark)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -153,18 +173,20 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _load_yaml(text: str, source: str) -> Any:
-    """YAML without aliases (a few lines of them can stand for gigabytes), each key once."""
-    for nodes, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
-        mark = event.start_mark
-        where = f"{source}, line {mark.line + 1 if mark else '?'}"
-        if isinstance(event, yaml.AliasEvent):
-            raise ConfigError(f"{where}: YAML aliases are not allowed; write the value out")
-        if nodes > _MAX_NODES:
-            raise ConfigError(f"{where}: more values than a configuration has; shorten it")
-        if isinstance(event, yaml.ScalarEvent) and _UNUSABLE.search(event.value):
-            raise ConfigError(f"{where}: a character that no text can hold; take it out")
-    return yaml.load(text, Loader=_UniqueKeyLoader)
+def load_yaml(text: str) -> Any:
+    """The value of a YAML text, read strictly.
+
+    Raises ValueError with one line, `line N: ` in front where the place is known.
+    """
+    try:
+        return yaml.load(text, Loader=StrictLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}: " if mark is not None else ""
+        what = getattr(error, "problem", None) or "a character that YAML does not allow"
+        raise ValueError(f"{where}is not YAML ({_one_line(what)})") from error
+    except _YAML_TROUBLE as error:
+        raise ValueError(f"is not a usable YAML value ({_one_line(str(error))})") from error
 
 
 def _expanded(path: str) -> Path:
@@ -184,9 +206,9 @@ def _apply(data: dict[str, Any], override: str) -> None:
     if _UNUSABLE.search(key):
         raise ConfigError(f"{said}: a character that no key holds; take it out")
     try:
-        value = _load_yaml(text, said)
-    except (yaml.YAMLError, *_YAML_TROUBLE) as error:
-        raise ConfigError(f"{said}: the value is not YAML; quote it") from error
+        value = load_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{said}: {error}; quote the value") from error
     if key.strip() in _PATH_KEYS and isinstance(value, str) and value:
         value = str(_expanded(value).absolute())
     node = data

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from bikeped.config.load import load_yaml
 from bikeped.errors import ScenarioError
 from bikeped.types import BoolArray, FloatArray
 
@@ -39,15 +40,6 @@ _MAX_BYTES = 1_000_000
 _MAX_DURATION_S = 3600.0
 _MAX_COORDINATE_M = 10_000.0
 _MAX_AGENTS = 1000
-#: What PyYAML raises beside YAMLError, on odd numbers, dates and explicit tags (`!!int ''`).
-_YAML_TROUBLE = (
-    ValueError,
-    OverflowError,
-    RecursionError,
-    TypeError,
-    LookupError,
-    AttributeError,
-)
 
 
 @dataclass(frozen=True)
@@ -172,12 +164,9 @@ def bundled_folder() -> Path:
 def parse_scenario(text: str, source: str) -> Scenario:
     """A scenario from YAML text; `source` names it in errors."""
     try:
-        _refuse_aliases(text, source)
-        data = yaml.safe_load(text)
-    except (yaml.YAMLError, *_YAML_TROUBLE) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark is not None else ""
-        raise ScenarioError(f"{source}{where}: is not YAML; check the indentation") from error
+        data = load_yaml(text)
+    except ValueError as error:
+        raise ScenarioError(f"{source}: {error}; correct it there") from error
     top = _mapping(data, source, "scenario")
     _known(top, {"name", "hazard", "expected", "vehicle", "agents", "story"}, source, "")
     name = top.get("name")
@@ -238,17 +227,6 @@ def _real(number: float) -> str:
     """Decimal text that YAML reads as the same number: to it, 1e-05 without a dot is a word."""
     text = repr(float(number))
     return text if "." in text else text.replace("e", ".0e")
-
-
-def _refuse_aliases(text: str, source: str) -> None:
-    """A few lines of aliases can stand for gigabytes, and nobody needs them here."""
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            mark = event.start_mark
-            raise ScenarioError(
-                f"{source}, line {mark.line + 1 if mark else '?'}: YAML aliases are not allowed; "
-                "write the value out"
-            )
 
 
 def _shown(value: object) -> str:
