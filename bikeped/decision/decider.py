@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,15 +19,6 @@ from bikeped.types import (
 )
 
 
-@dataclass(frozen=True)
-class _FrameRows:
-    time_s: float
-    id: IntArray
-    kind: KindArray
-    xy_m: FloatArray
-    previous: IndexArray  #: index within the frame before, or -1
-
-
 class Decider:
     """Holds the last fraction of a second of positions and the cyclist memory.
 
@@ -38,16 +27,15 @@ class Decider:
 
     def __init__(self, settings: RuleSettings) -> None:
         self.settings = settings
-        self._frames: deque[_FrameRows] = deque()
+        self._rows = _NO_ROWS
+        self._starts: list[tuple[float, int]] = []  #: time and first row of each frame held
         self._last_cyclist_s = -math.inf
         self._span_s = max(settings.lookback_s, settings.speed_window_s)
 
     def step(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> Decision:
         """The decision at `time_s`; `ids` [n] ascending, `kind` [n], `xy_m` [n, 2]."""
         self._append(time_s, ids, kind, xy_m)
-        rows = self._rows()
-        frames = len(self._frames)
-        verdicts, pair_ids = _judge_newest(rows, frames, self.settings)
+        verdicts, pair_ids = _judge_newest(self._rows, len(self._starts), self.settings)
         if (kind == CYCLIST).any():
             self._last_cyclist_s = time_s
         pedestrians = int((kind == PEDESTRIAN).sum())
@@ -71,36 +59,42 @@ class Decider:
         )
 
     def _append(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> None:
-        if self._frames and time_s <= self._frames[-1].time_s:
-            raise ValueError(
-                f"time_s: {time_s} is not after the last frame's {self._frames[-1].time_s}"
-            )
-        previous: IndexArray = np.full(len(ids), -1, np.intp)
-        if self._frames and len(ids) and len(self._frames[-1].id):
-            before = self._frames[-1].id
-            place = np.minimum(np.searchsorted(before, ids), len(before) - 1)
-            previous = np.where(before[place] == ids, place, -1)
-        self._frames.append(_FrameRows(time_s, ids, kind, xy_m, previous))
+        """Adds the newest frame's rows and drops frames older than the rules look back."""
+        starts, rows = self._starts, self._rows
+        if starts and time_s <= starts[-1][0]:
+            raise ValueError(f"time_s: {time_s} is not after the last frame's {starts[-1][0]}")
         # One frame beyond the span is kept: the older neighbour of an interpolation.
-        while len(self._frames) > 2 and self._frames[1].time_s < time_s - self._span_s - 1e-6:
-            self._frames.popleft()
-
-    def _rows(self) -> TrackRows:
-        frames = list(self._frames)
-        counts = [len(f.id) for f in frames]
-        starts = np.cumsum([0, *counts])
-        previous = [
-            np.where(f.previous >= 0, f.previous + starts[i - 1], -1) if i else np.full(n, -1)
-            for i, (f, n) in enumerate(zip(frames, counts, strict=True))
-        ]
-        return TrackRows(
-            frame=np.repeat(np.arange(len(frames)), counts),
-            time_s=np.repeat([f.time_s for f in frames], counts),
-            id=np.concatenate([f.id for f in frames]),
-            kind=np.concatenate([f.kind for f in frames]),
-            xy_m=np.concatenate([f.xy_m for f in frames]),
-            previous=np.concatenate(previous).astype(np.intp),
+        drop = 0
+        while drop + 2 < len(starts) and starts[drop + 1][0] < time_s - self._span_s - 1e-6:
+            drop += 1
+        cut = starts[drop][1] if drop else 0
+        held, last = len(rows) - cut, (starts[-1][1] if starts else 0)
+        previous: IndexArray = np.full(len(ids), -1, np.intp)
+        before = rows.id[last:]
+        if len(ids) and len(before):
+            place = np.minimum(np.searchsorted(before, ids), len(before) - 1)
+            previous = np.where(before[place] == ids, place + (last - cut), -1)
+        self._starts = [(t, row - cut) for t, row in starts[drop:]] + [(time_s, held)]
+        self._rows = TrackRows(
+            frame=np.concatenate(
+                [rows.frame[cut:] - drop, np.full(len(ids), len(self._starts) - 1, np.intp)]
+            ),
+            time_s=np.concatenate([rows.time_s[cut:], np.full(len(ids), time_s)]),
+            id=np.concatenate([rows.id[cut:], ids]),
+            kind=np.concatenate([rows.kind[cut:], kind]),
+            xy_m=np.concatenate([rows.xy_m[cut:], xy_m]),
+            previous=np.concatenate([np.maximum(rows.previous[cut:] - cut, -1), previous]),
         )
+
+
+_NO_ROWS = TrackRows(
+    frame=np.zeros(0, np.intp),
+    time_s=np.zeros(0),
+    id=np.zeros(0, np.int64),
+    kind=np.zeros(0, np.int8),
+    xy_m=np.zeros((0, 2)),
+    previous=np.zeros(0, np.intp),
+)
 
 
 def _judge_newest(

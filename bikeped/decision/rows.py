@@ -57,12 +57,13 @@ class Pairs:
 def pair_rows(rows: TrackRows, frames: int, first_frame: int = 0) -> Pairs:
     """All cyclist-pedestrian pairs of each of the frames first_frame..frames-1."""
     asked = rows.frame >= first_frame
-    cyclist_row = np.nonzero(asked & (rows.kind == CYCLIST))[0]
-    pedestrian_row = np.nonzero(asked & (rows.kind == PEDESTRIAN))[0]
+    cyclist_row = (asked & (rows.kind == CYCLIST)).nonzero()[0]
+    pedestrian_row = (asked & (rows.kind == PEDESTRIAN)).nonzero()[0]
     count = np.bincount(rows.frame[pedestrian_row], minlength=frames)
-    start = np.cumsum(count) - count
+    start = count.cumsum() - count
     frame = rows.frame[cyclist_row]
     times = count[frame]
-    cyclist = np.repeat(np.arange(len(cyclist_row)), times)
-    within = np.arange(len(cyclist)) - np.repeat(np.cumsum(times) - times, times)
-    return Pairs(cyclist_row, cyclist, pedestrian_row[np.repeat(start[frame], times) + within])
+    cyclist = np.arange(len(cyclist_row)).repeat(times)
+    # Where a cyclist's first pedestrian stands, less where its first pair does.
+    shift = (start[frame] - (times.cumsum() - times)).repeat(times)
+    return Pairs(cyclist_row, cyclist, pedestrian_row[shift + np.arange(len(cyclist))])

@@ -90,7 +90,7 @@ def judge(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairVerdicts
         & (_length(p_now) <= settings.max_range_m)
     )
     # Only these are looked up in the past: of thousands of pairs in a crowd few are within bounds.
-    index = np.nonzero(near)[0]
+    index = near.nonzero()[0]
     c_then, p_then, elapsed = _look_back(
         rows, cyclist[index], pedestrian[index], settings.lookback_s
     )
@@ -160,7 +160,7 @@ def _look_back(
     while True:
         c_prev, p_prev = rows.previous[c_old], rows.previous[p_old]
         go = (c_prev >= 0) & (p_prev >= 0) & (rows.time_s[c_old] > target + EPSILON_S)
-        if not go.any():
+        if not np.count_nonzero(go):
             break
         c_new, p_new = np.where(go, c_old, c_new), np.where(go, p_old, p_new)
         c_old, p_old = np.where(go, c_prev, c_old), np.where(go, p_prev, p_old)
@@ -168,7 +168,7 @@ def _look_back(
     old_s = rows.time_s[c_old]
     overshoot = target - old_s
     between = overshoot > EPSILON_S
-    if between.any():
+    if np.count_nonzero(between):
         gap = np.where(between, rows.time_s[c_new] - old_s, 1.0)
         part = np.where(between, overshoot / gap, 0.0)[:, None]
         c_then = c_then + part * (rows.xy_m[c_new] - c_then)
@@ -184,7 +184,7 @@ def _speed(rows: TrackRows, row: IndexArray, window_s: float) -> FloatArray:
     while True:
         previous = rows.previous[old]
         go = (previous >= 0) & (rows.time_s[old] > now - window_s + EPSILON_S)
-        if not go.any():
+        if not np.count_nonzero(go):
             break
         old = np.where(go, previous, old)
     elapsed = now - rows.time_s[old]

@@ -28,7 +28,7 @@ def match_greedy(
     matched = np.full(tracks, -1, np.intp)
     if len(cost) == 0:
         return matched
-    order = np.argsort(cost, kind="stable")
+    order = cost.argsort(kind="stable")
     track, detection = track[order], detection[order]
     first_of_track = np.empty(tracks, np.intp)
     first_of_detection = np.empty(detections, np.intp)
@@ -39,7 +39,7 @@ def match_greedy(
         first_of_detection[detection[::-1]] = rank[::-1]
         mutual = (first_of_track[track] == rank) & (first_of_detection[detection] == rank)
         matched[track[mutual]] = detection[mutual]
-        if mutual.all():
+        if np.count_nonzero(mutual) == len(mutual):
             break
         taken = np.zeros(detections, np.bool_)
         taken[detection[mutual]] = True

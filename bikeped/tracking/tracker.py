@@ -36,8 +36,8 @@ class Tracker:
         """Tracks at `time_s` seconds after the detections `points` of that moment."""
         lanes = self.lanes
         lanes.update(time_s, points.xy_m[None], points.kind[None])
-        slot = np.nonzero(lanes.reported[0])[0]
-        slot = slot[np.argsort(lanes.id[0, slot], kind="stable")]
+        slot = lanes.reported[0].nonzero()[0]
+        slot = slot[lanes.id[0, slot].argsort(kind="stable")]
         ids = lanes.id[0, slot]
         xy = lanes.xy_m[0, slot]
         velocity = self._remember(ids.tolist(), xy, time_s)
