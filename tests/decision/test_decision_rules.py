@@ -154,6 +154,15 @@ def test_parallel_paths_at_a_constant_gap_fool_the_naive_rule_only():
     assert {d.state for d in run(naive, ahead)} == {State.WARNING}
 
 
+def test_rounding_does_not_look_like_closing():
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        c, p = rng.uniform(-8, 8, 2), rng.uniform(-8, 8, 2)
+        v = rng.uniform(-3, 3, 2) + np.array([4.0, 0.0])
+        frames = pair(lambda t, c=c, v=v: c + v * t, lambda t, p=p, v=v: p + v * t, 20)
+        assert {d.state for d in run(replace(SELECTED, d_min_m=0.0), frames)} == {State.WARNING}
+
+
 def test_a_real_approach_fires_both_and_a_real_retreat_neither():
     towards = pair(lambda t: (0.0, 20 - 5 * t), still(1.0, 2.0), 60)
     away = pair(lambda t: (0.0, 6 + 5 * t), still(1.0, 2.0), 60)
