@@ -143,7 +143,7 @@ class CameraConfig(_Section, frozen=True):
     ] = 0.0
     table_step_px: Annotated[
         int,
-        Meta(ge=1, le=64, description="spacing of the ground table's lattice, crop pixels"),
+        Meta(ge=2, le=64, description="spacing of the ground table's lattice, crop pixels"),
     ] = 8
     stale_after_s: Annotated[
         float,

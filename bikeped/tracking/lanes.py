@@ -84,6 +84,11 @@ class LaneTracker:
             raise ValueError(f"time_s: {time_s} is before the last update at {self.time_s}")
         step_s = time_s - self.time_s if math.isfinite(self.time_s) else 0.0
         self.time_s = time_s
+        if step_s > 2 * self.settings.frame_s:
+            # After a silence: what ran out meanwhile must not be matched first and dropped later.
+            self.alive &= time_s - self.seen_s <= (
+                self.settings.max_unseen_s + 1.5 * self.settings.frame_s
+            )
         self.xy_m = np.where(
             self.alive[..., None], self.xy_m + self.velocity_mps * step_s, self.xy_m
         )
