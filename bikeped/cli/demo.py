@@ -36,7 +36,7 @@ def command(
         write_clip,
     )
     from bikeped.service.drawn import DrawnEye
-    from bikeped.service.run import ReplayFiles, replay
+    from bikeped.service.replay import ReplayFiles, replay
 
     loaded = load_config(config_path, overrides)
     make_folder(out)

@@ -14,7 +14,7 @@ from bikeped.config import load_config
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
-    from bikeped.service.run import ReplayResult
+    from bikeped.service.replay import ReplayResult
 
 
 @click.command("replay")
@@ -42,7 +42,7 @@ def command(
     json_path: str | None,
 ) -> None:
     """Run VIDEO (a file or a folder of pictures) through the loop and say what it decided."""
-    from bikeped.service.run import ReplayFiles, replay
+    from bikeped.service.replay import ReplayFiles, replay
 
     loaded = load_config(config_path, overrides)
     if out is not None:

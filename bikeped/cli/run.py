@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
+import sys
 from pathlib import Path
+from typing import NoReturn
 
 import click
 
@@ -13,17 +16,15 @@ from bikeped.config import load_config
 
 @click.command("run")
 @config_options
-def command(config_path: Path | None, overrides: tuple[str, ...]) -> int:
+def command(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
     """Watch the crossing until told to stop (SIGTERM): the service."""
-    from bikeped.service.run import EXIT_RESTART, run_service
+    from bikeped.service.run import run_service
 
     root = logging.getLogger()
     root.setLevel(min(root.level, logging.INFO))
     status = run_service(load_config(config_path, overrides))
-    if status == EXIT_RESTART:
-        # A thread is stuck in a driver; only leaving without joining it ends the process.
-        logging.shutdown()
-        import os
-
-        os._exit(status)
-    return status
+    # Everything is stopped and the light is dark. A thread that is stuck in a driver must not keep
+    # the process: leave without joining it.
+    logging.shutdown()
+    sys.stdout.flush()
+    os._exit(status)

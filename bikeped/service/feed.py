@@ -6,10 +6,10 @@ import asyncio
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
 from bikeped.capture import FrameGrabber, FrameSource
+from bikeped.service.workers import Worker
 from bikeped.types import Frame
 
 
@@ -33,7 +33,11 @@ class Feed(Protocol):
     def error(self) -> str | None:
         """What is wrong with the source now, in one line."""
 
-    async def close(self) -> None: ...
+    def restart(self) -> None:
+        """Asks for a fresh source: what this one delivers is of no use."""
+
+    async def close(self) -> None:
+        """Gives the source back; takes a bounded time, whatever the source does."""
 
 
 class LiveFeed:
@@ -66,6 +70,9 @@ class LiveFeed:
         error = self._grabber.error
         return None if error is None else str(error)
 
+    def restart(self) -> None:
+        self._grabber.restart()
+
     async def close(self) -> None:
         await asyncio.to_thread(self._grabber.stop)
 
@@ -77,17 +84,16 @@ class RecordedFeed:
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="read")
+        self._reader = Worker("read")
         self._ahead: asyncio.Future[tuple[Frame | None, float]] | None = None
 
     async def next(self) -> tuple[Frame, float] | None:
-        loop = asyncio.get_running_loop()
-        if self._ahead is None:
-            self._ahead = loop.run_in_executor(self._pool, _timed, self._source.read)
-        frame, took_ms = await self._ahead
+        ahead = self._ahead or self._reader.submit(_timed, self._source.read)
+        frame, took_ms = await ahead
         if frame is None:
+            self._ahead = ahead  # asked once more, it is still the end
             return None
-        self._ahead = loop.run_in_executor(self._pool, _timed, self._source.read)
+        self._ahead = self._reader.submit(_timed, self._source.read)
         return frame, took_ms
 
     def newest_s(self, now_s: float) -> float | None:
@@ -102,12 +108,15 @@ class RecordedFeed:
     def error(self) -> str | None:
         return None
 
+    def restart(self) -> None:
+        """Nothing: a recording has but one beginning."""
+
     async def close(self) -> None:
         if self._ahead is not None:
             self._ahead.cancel()
-            await asyncio.wait([self._ahead])
-        await asyncio.get_running_loop().run_in_executor(self._pool, self._source.close)
-        self._pool.shutdown()
+            await asyncio.gather(self._ahead, return_exceptions=True)
+        self._reader.submit(self._source.close)
+        await self._reader.close()
 
 
 def _timed(read: Callable[[], Frame | None]) -> tuple[Frame | None, float]:

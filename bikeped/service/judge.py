@@ -26,9 +26,14 @@ from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 
 @dataclass(frozen=True)
 class Judgement:
-    """What one frame led to; `track_ms` and `decide_ms` are how long that took."""
+    """What one frame led to; `track_ms` and `decide_ms` are how long that took.
+
+    `not_on_ground` detections end above the horizon or outside the image circle: a few are
+    reflections and hoardings, most of them are a camera that hangs otherwise than configured.
+    """
 
     points: GroundPoints
+    not_on_ground: int
     tracks: Tracks
     decision: Decision
     track_ms: float
@@ -70,13 +75,14 @@ class Judge:
             self._framings = {(width, height): known}
         return known
 
-    def ground(self, detections: Detections, frame: Framing) -> GroundPoints:
-        """Detections on the ground; those above the horizon or out of range are left out."""
+    def ground(self, detections: Detections, frame: Framing) -> tuple[GroundPoints, int]:
+        """Detections on the ground and in range, and how many do not lie on the ground at all."""
         crop = frame.frame_to_crop(detections.bottom_centre_px())
         xy, valid = self.table.lookup(crop)
         near = valid & (np.nan_to_num(np.hypot(xy[:, 0], xy[:, 1]), nan=np.inf) < self._max_range_m)
         index = np.nonzero(near)[0]
-        return GroundPoints(detections.kind[index], xy[index], index.astype(np.int64))
+        points = GroundPoints(detections.kind[index], xy[index], index.astype(np.int64))
+        return points, int((~valid).sum())
 
     def judge(
         self, detections: Detections, width: int, height: int, captured_s: float, age_s: float
@@ -87,10 +93,10 @@ class Judge:
         times must increase: a frame that is not newer than the last one is a ValueError.
         """
         began = time.perf_counter()
-        if captured_s <= self._last_s:
+        if not captured_s > self._last_s:  # NaN included
             raise ValueError(f"captured_s: {captured_s} is not after {self._last_s}")
         self._last_s = captured_s
-        points = self.ground(detections, self.framing_of(width, height))
+        points, not_on_ground = self.ground(detections, self.framing_of(width, height))
         tracks = self.tracker.update(points, captured_s)
         tracked = time.perf_counter()
         decision = self._decider.step(
@@ -98,7 +104,12 @@ class Judge:
         )
         decided = time.perf_counter()
         return Judgement(
-            points, tracks, decision, (tracked - began) * 1e3, (decided - tracked) * 1e3
+            points=points,
+            not_on_ground=not_on_ground,
+            tracks=tracks,
+            decision=decision,
+            track_ms=(tracked - began) * 1e3,
+            decide_ms=(decided - tracked) * 1e3,
         )
 
     def _ahead(self, tracks: Tracks, age_s: float) -> FloatArray:

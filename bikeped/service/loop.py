@@ -7,6 +7,9 @@ differ only in their feed and their clock.
 
 FAULT is decided by a tick of its own, ten times a second, from the ages of the newest frame and
 the newest answer: neither a camera nor a detector that has stopped can keep it from coming.
+
+On a live feed nothing that a camera or a detector does ends the loop, but for `Hung`. In a replay
+nobody stands at a crossing, so there every error is told at once.
 """
 
 from __future__ import annotations
@@ -14,22 +17,26 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from bikeped.detection.base import DetectorAnswer
-from bikeped.errors import CaptureError, DetectorError, GeometryError
-from bikeped.feedback import LightDriver, SignalLogic, Speaker, assess
+from bikeped.errors import BikepedError, CaptureError, GeometryError
+from bikeped.feedback import assess
+from bikeped.service.announcer import Announcer
 from bikeped.service.feed import Feed
 from bikeped.service.judge import Judge, Judgement
-from bikeped.service.vision import Decoder, Eye, Picture
-from bikeped.types import Detections, Frame, Signal, State
+from bikeped.service.seldom import Seldom
+from bikeped.service.vision import Picture, Vision
+from bikeped.service.workers import Worker
+from bikeped.types import Detections, Frame, Signal
 
 log = logging.getLogger(__name__)
 
-TICK_S = 0.1
+#: Frames that do not decode for this long: the camera is opened anew.
+RESTART_AFTER_S = 5.0
+_WEIGHT = 0.2  #: of the newest duration in the usual one
 
 
 class Hung(Exception):  # noqa: N818  a state to leave, not an error of the user's
@@ -48,25 +55,32 @@ class Outcome:
 
 
 class Output(Protocol):
-    """Takes outcomes: telemetry, audit log, event file, overlay. Must not block when live."""
+    """Takes outcomes: telemetry, audit log, event file, overlay."""
 
     async def frame(self, outcome: Outcome) -> None:
-        """One frame's outcome. A live output only puts it aside."""
+        """One frame's outcome. On a live feed it is only put aside: the loop waits for this."""
 
-    def signal(self, signal: Signal, sentence: str) -> None:
-        """What the light shows now, with every frame and every tick."""
+
+@dataclass(frozen=True)
+class Limits:
+    """When the loop loses its patience, in seconds."""
+
+    stale_after_s: float = 0.5  #: no frame: FAULT
+    silent_after_s: float = 0.5  #: no answer of the detector: FAULT
+    hang_after_s: float = 15.0  #: a call that does not return, a detector that only fails: Hung
+    tick_s: float = 0.1
+    close_s: float = 2.0  #: how long a thread may take to end
 
 
 @dataclass
 class Counts:
     """Totals since the start."""
 
+    received: int = 0
     frames: int = 0  #: judged
     undecodable: int = 0
     failed: int = 0  #: the detector raised
     out_of_order: int = 0
-    received: int = 0
-    last_errors: dict[str, str] = field(default_factory=dict)
 
 
 class Loop:
@@ -76,80 +90,93 @@ class Loop:
         self,
         *,
         feed: Feed,
-        decoder: Decoder,
-        eye: Eye,
+        vision: Vision,
         judge: Judge,
-        logic: SignalLogic,
-        light: LightDriver | None,
-        speaker: Speaker | None,
-        outputs: list[Output],
-        stale_after_s: float = 0.5,
-        silent_after_s: float = 0.5,
-        hang_after_s: float = 15.0,
+        announcer: Announcer,
+        outputs: Sequence[Output] = (),
+        limits: Limits = Limits(),
         clock: Callable[[], float] = time.monotonic,
         on_tick: Callable[[], None] = lambda: None,
     ) -> None:
-        self._feed, self._decoder, self._eye, self._judge = feed, decoder, eye, judge
-        self._logic, self._light, self._speaker = logic, light, speaker
-        self._outputs = outputs
-        self._stale_after_s, self._silent_after_s = stale_after_s, silent_after_s
-        self._hang_after_s = hang_after_s
+        self._feed, self._vision, self._judge = feed, vision, judge
+        self._announcer = announcer
+        self._outputs = tuple(outputs)
+        self._limits = limits
         self._clock = clock
         self._on_tick = on_tick
         self.counts = Counts()
-        self.last_answer_s: float | None = None  #: capture time of the newest frame answered
-        self.last_frame_size: tuple[int, int] | None = None
-        self.shown: Signal | None = None
-        self._geometry_fault: str | None = None
-        self._sentence = ""
-        self._looking_since: float | None = None
+        self._seldom = Seldom(log)
         self._stop = asyncio.Event()
+        # What is wrong now; the first text of a row of failures stays, so that one row is one fault
+        self._geometry_fault: str | None = None
+        self._decode_fault: tuple[str, float] | None = None
+        self._detector_fault: tuple[str, float] | None = None
+        self._answered_s: float | None = None  # capture time of the newest frame answered
+        self._judged_s: float | None = None  # capture time of the newest frame judged
+        self._looking_since_s: float | None = None
+        self._usual_look_s = self._usual_decode_s = 0.0
 
     def stop(self) -> None:
-        """Ends `run` after the frame in hand; callable from a signal handler."""
+        """Ends `run`; callable from a signal handler."""
         self._stop.set()
 
-    async def run(self) -> None:
-        """Runs until the recording ends or `stop` is called.
+    def dropped(self) -> int:
+        """Frames replaced by a newer one before anybody looked."""
+        return self._feed.dropped()
 
-        Raises Hung when a read or the detector has not returned for `hang_after_s`; for a
-        recording also the error of a frame that cannot be judged (GeometryError, DetectorError).
+    def frame_age_s(self) -> float | None:
+        """Age of the newest frame of a live feed; None before the first."""
+        now_s = self._clock()
+        newest_s = self._feed.newest_s(now_s)
+        return None if newest_s is None else max(0.0, now_s - newest_s)
+
+    async def run(self) -> None:
+        """Runs until the recording ends or `stop` is called; the light is then dark.
+
+        Raises Hung when a read or the detector has not returned for `hang_after_s`, and leaves the
+        light in FAULT; for a recording also the error of a frame that cannot be judged
+        (GeometryError, DetectorError). Threads that hang are left behind: they are daemons.
         """
         slot = _Slot()
-        pools = [ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("decode", "look")]
-        looking = asyncio.create_task(self._look(slot, pools[1]), name="look")
-        tasks = {
+        decoder, looker = Worker("decode", self._clock), Worker("look", self._clock)
+        looking = asyncio.create_task(self._look(slot, looker), name="look")
+        stopping = asyncio.create_task(self._stop.wait(), name="stop")
+        tasks: set[asyncio.Task[None] | asyncio.Task[bool]] = {
             looking,
-            asyncio.create_task(self._decode(slot, pools[0]), name="decode"),
-            asyncio.create_task(self._stop.wait(), name="stop"),
+            stopping,
+            asyncio.create_task(self._decode(slot, decoder), name="decode"),
         }
-        stopping = next(task for task in tasks if task.get_name() == "stop")
         if self._feed.live:
-            tasks.add(asyncio.create_task(self._tick(), name="tick"))
-        hung = False
+            tasks.add(asyncio.create_task(self._tick((decoder, looker)), name="tick"))
         try:
             pending = set(tasks)
             while not (looking.done() or stopping.done()):
                 done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
                     task.result()  # a failure of any of them ends the loop
-        except Hung:
-            hung = True
+        except Hung as hang:
+            self._announcer.step(self._clock(), None, (str(hang),))
             raise
+        except BaseException:
+            self._announcer.off()
+            raise
+        else:
+            self._announcer.off()
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            for pool in pools:  # a hung thread cannot be joined: the process ends without it
-                pool.shutdown(wait=not hung, cancel_futures=True)
-            if not hung:
-                await self._feed.close()
+            await asyncio.gather(
+                decoder.close(self._limits.close_s),
+                looker.close(self._limits.close_s),
+                self._feed.close(),
+            )
 
-    async def _decode(self, slot: _Slot, pool: ThreadPoolExecutor) -> None:
-        loop = asyncio.get_running_loop()
+    async def _decode(self, slot: _Slot, worker: Worker) -> None:
         while True:
             # Room first, then the frame: a live frame taken early would only grow old.
             await slot.room()
+            await self._until_wanted()
             taken = await self._feed.next()
             if taken is None:
                 slot.put(None)
@@ -158,64 +185,91 @@ class Loop:
             self.counts.received += 1
             began = time.perf_counter()
             try:
-                picture = await loop.run_in_executor(
-                    pool, self._decoder.decode, frame, began, acquire_ms
-                )
+                picture = await worker.submit(self._vision.decode, frame, began, acquire_ms)
             except CaptureError as error:
                 self.counts.undecodable += 1
-                self._say("decode", str(error))
+                self._seldom.warn("decode", f"frame {frame.number} is skipped: {error}")
+                self._decode_fault = self._decode_fault or (
+                    f"camera: frames do not decode ({error})",
+                    self._clock(),
+                )
                 continue
+            self._decode_fault = None
+            self._usual_decode_s += _WEIGHT * (picture.decode_ms / 1e3 - self._usual_decode_s)
             slot.put(picture)
 
-    async def _look(self, slot: _Slot, pool: ThreadPoolExecutor) -> None:
-        loop = asyncio.get_running_loop()
+    async def _until_wanted(self) -> None:
+        """Waits while the eye is sure to be busy: what is taken too early ages in the slot."""
+        if self._looking_since_s is not None:
+            free_s = self._looking_since_s + self._usual_look_s
+            ahead_s = 2 * self._usual_decode_s + 0.005
+            await asyncio.sleep(min(max(free_s - ahead_s - time.perf_counter(), 0.0), 0.2))
+
+    async def _look(self, slot: _Slot, worker: Worker) -> None:
         while True:
             picture = await slot.take()
             if picture is None:
                 return
-            self._looking_since = time.monotonic()
-            try:
-                answer = await loop.run_in_executor(pool, self._eye.see, picture)
-            except DetectorError as error:
-                if not self._feed.live:
-                    raise
-                self.counts.failed += 1
-                self._say("detector", str(error))
-                continue
-            finally:
-                self._looking_since = None
-            await self._finish(picture, answer)
+            answer = await self._answer(picture, worker)
+            if answer is not None:
+                await self._finish(picture, answer)
 
-    async def _finish(self, picture: Picture, answer: DetectorAnswer) -> None:
-        """Judges one answered frame, tells the light, and hands the outcome on."""
+    async def _answer(self, picture: Picture, worker: Worker) -> DetectorAnswer | None:
+        """What the eye says of a picture; None when a live one cannot be looked at."""
         frame = picture.frame
-        now_s = self._now(frame)
-        self.last_frame_size = (frame.width, frame.height)
         try:
-            judgement = self._judge.judge(
-                answer.detections,
-                frame.width,
-                frame.height,
-                frame.captured_s,
-                max(0.0, now_s - frame.captured_s),
-            )
+            self._judge.framing_of(frame.width, frame.height)
         except GeometryError as error:
             if not self._feed.live:
                 raise
             self._geometry_fault = f"geometry: {error}"
-            self._show(now_s, None)
-            return
-        except ValueError as error:  # a time stamp that went back: a camera that was reopened
-            self.counts.out_of_order += 1
-            self._say("order", str(error))
-            return
+            self._show()
+            return None
         self._geometry_fault = None
-        self.last_answer_s = frame.captured_s
+        self._looking_since_s = time.perf_counter()
+        try:
+            answer = await worker.submit(self._vision.see, picture)
+        except Exception as error:
+            if not self._feed.live:
+                raise
+            self.counts.failed += 1
+            if isinstance(error, BikepedError):
+                self._seldom.warn("detector", f"frame {frame.number} is skipped: {error}")
+            else:
+                self._seldom.failure("detector", error)
+            self._detector_fault = self._detector_fault or (f"detector: {error}", self._clock())
+            return None
+        finally:
+            took_s = time.perf_counter() - self._looking_since_s
+            self._usual_look_s += _WEIGHT * (took_s - self._usual_look_s)
+            self._looking_since_s = None
+        self._detector_fault = None
+        return answer
+
+    async def _finish(self, picture: Picture, answer: DetectorAnswer) -> None:
+        """Judges one answered frame, tells the light, and hands the outcome on."""
+        frame = picture.frame
+        if self._judged_s is not None and not frame.captured_s > self._judged_s:
+            # A camera that was opened anew, on another clock. Its frames are believed again as soon
+            # as they are newer; until then the silence becomes a FAULT.
+            self.counts.out_of_order += 1
+            self._seldom.warn("order", f"frame {frame.number} is skipped: its time went back")
+            return
+        self._judged_s = frame.captured_s
+        now_s = self._now(frame)
+        judgement = self._judge.judge(
+            answer.detections,
+            frame.width,
+            frame.height,
+            frame.captured_s,
+            max(0.0, now_s - frame.captured_s),
+        )
+        self._answered_s = frame.captured_s
         self.counts.frames += 1
         began = time.perf_counter()
-        self._sentence = judgement.decision.sentence
-        signal = self._show(now_s, judgement.decision.state)
+        signal = self._announcer.step(now_s, judgement.decision, self._faults(now_s))
         ended = time.perf_counter()
+        total_ms = (ended - picture.received_s) * 1e3
         latency = {
             "acquire": picture.acquire_ms,
             "pre": picture.decode_ms + answer.pre_ms,
@@ -224,22 +278,31 @@ class Loop:
             "track": judgement.track_ms,
             "decide": judgement.decide_ms,
             "feedback": (ended - began) * 1e3,
-            "total": (ended - picture.received_s) * 1e3,
-            "capture_age": (ended - picture.received_s) * 1e3 + picture.acquire_ms,
+            "total": total_ms,
+            "capture_age": total_ms + picture.acquire_ms,
         }
         outcome = Outcome(picture, answer.detections, judgement, signal, latency)
         for output in self._outputs:
-            await output.frame(outcome)
+            await self._hand_on(output, outcome)
 
-    def dropped(self) -> int:
-        """Frames replaced by a newer one before anybody looked."""
-        return self._feed.dropped()
+    async def _hand_on(self, output: Output, outcome: Outcome) -> None:
+        try:
+            await output.frame(outcome)
+        except Exception as error:
+            if not self._feed.live:
+                raise
+            self._seldom.failure("output", error)
 
     def _now(self, frame: Frame) -> float:
         """Live: the clock. A recording has no other time than its own."""
         return self._clock() if self._feed.live else frame.captured_s
 
-    def faults(self, now_s: float) -> tuple[str, ...]:
+    def _show(self) -> None:
+        """Shows what a moment without a new decision leads to."""
+        now_s = self._clock()
+        self._announcer.step(now_s, None, self._faults(now_s))
+
+    def _faults(self, now_s: float) -> tuple[str, ...]:
         """Why the light must not trust the decision; empty when it may."""
         if not self._feed.live:
             return ()
@@ -247,48 +310,37 @@ class Loop:
         error = self._feed.error()
         if error is not None:
             explicit.append(f"camera: {error}")
-        return assess(
+        faults = assess(
             now_s,
             self._feed.newest_s(now_s),
-            self.last_answer_s,
-            self._stale_after_s,
-            self._silent_after_s,
+            self._answered_s,
+            self._limits.stale_after_s,
+            self._limits.silent_after_s,
             explicit=tuple(explicit),
         )
+        if not faults:  # one bad frame among good ones is no fault
+            return ()
+        causes = [cause[0] for cause in (self._decode_fault, self._detector_fault) if cause]
+        return (*faults, *causes)
 
-    def _show(self, now_s: float, state: State | None) -> Signal:
-        faults = self.faults(now_s)
-        signal = self._logic.step(now_s, state, faults)
-        if self._light is not None:
-            self._light.show(signal)
-        if self._speaker is not None:
-            self._speaker.play(signal.sound)
-        sentence = "; ".join(signal.faults) if signal.name == "FAULT" else self._sentence
-        if self.shown is None or self.shown.name != signal.name:
-            log.info("%s: %s", signal.name, sentence)
-        self.shown = signal
-        for output in self._outputs:
-            output.signal(signal, sentence)
-        return signal
-
-    async def _tick(self) -> None:
+    async def _tick(self, workers: tuple[Worker, ...]) -> None:
         """Judges the silence between frames, and whether a thread is stuck."""
+        limit_s = self._limits.hang_after_s
         while True:
-            await asyncio.sleep(TICK_S)
-            now_s = self._clock()
-            self._show(now_s, None)
+            await asyncio.sleep(self._limits.tick_s)
+            self._show()
             self._on_tick()
-            if self._feed.hung_s(now_s) > self._hang_after_s:
-                raise Hung(f"the camera's read has not returned for {self._hang_after_s:g} s")
-            since = self._looking_since
-            if since is not None and time.monotonic() - since > self._hang_after_s:
-                raise Hung(f"the detector has not returned for {self._hang_after_s:g} s")
-
-    def _say(self, what: str, text: str) -> None:
-        """Logs a failure when it changes, not thirty times a second."""
-        if self.counts.last_errors.get(what) != text:
-            log.warning("%s", text)
-            self.counts.last_errors[what] = text
+            now_s = self._clock()
+            if self._feed.hung_s(now_s) > limit_s:
+                raise Hung(f"camera: a read has not returned for {limit_s:g} s")
+            if max(worker.busy_s(now_s) for worker in workers) > limit_s:
+                raise Hung(f"detector: has not returned for {limit_s:g} s")
+            # A GPU that has failed once may fail until the process ends.
+            if self._detector_fault is not None and now_s - self._detector_fault[1] > limit_s:
+                raise Hung(f"{self._detector_fault[0]} (for {limit_s:g} s)")
+            if self._decode_fault is not None and (now_s - self._decode_fault[1] > RESTART_AFTER_S):
+                self._decode_fault = (self._decode_fault[0], now_s)
+                self._feed.restart()
 
 
 class _Slot:

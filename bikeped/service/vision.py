@@ -53,11 +53,14 @@ class ModelEye:
         return self._detector.infer(picture.rgb, picture.frame.width, picture.frame.height)
 
 
-class Decoder:
-    """Decodes frames at the smallest scale that the eye (and a picture for people) needs."""
+class Vision:
+    """An eye, and the decoding at the smallest scale that it (and a picture for people) needs.
+
+    `decode` and `see` each belong to one thread, which may be two.
+    """
 
     def __init__(self, eye: Eye, view_width: int = 0) -> None:
-        self._eye = eye
+        self.eye = eye
         self._view_width = view_width
         self._jpeg = JpegDecoder(buffers=PICTURES)
 
@@ -68,9 +71,13 @@ class Decoder:
             rgb = frame.rgb
         else:
             assert frame.jpeg is not None  # noqa: S101  Frame holds one of the two
-            width, height = self._eye.decode_size(frame.width, frame.height)
+            width, height = self.eye.decode_size(frame.width, frame.height)
             view = min(self._view_width, frame.width)
             if view > width:
                 width, height = view, max(height, round(frame.height * view / frame.width))
             rgb = self._jpeg.decode(frame.jpeg, min_width=width, min_height=height)
         return Picture(frame, rgb, received_s, acquire_ms, (time.perf_counter() - began) * 1e3)
+
+    def see(self, picture: Picture) -> DetectorAnswer:
+        """What the eye finds in the picture; raises DetectorError."""
+        return self.eye.see(picture)

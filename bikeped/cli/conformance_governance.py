@@ -1,0 +1,440 @@
+"""`bikeped conformance gate|promote|contest|register|plot`: who may change what, and why."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from bikeped.cli.common import (
+    config_options,
+    console,
+    json_option,
+    progress_bar,
+    write_json,
+    write_whole,
+)
+from bikeped.config import LoadedConfig, load_config
+from bikeped.config.candidate import load_decision
+from bikeped.errors import BikepedError, ConfigError
+
+if TYPE_CHECKING:
+    from bikeped.conformance.gates import Gate
+    from bikeped.conformance.suite import Suite
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def add_commands(group: click.Group) -> None:
+    """Adds the governance commands to `bikeped conformance`."""
+    for command in (gate, promote, contest, register, plot):
+        group.add_command(command)
+
+
+def scenarios_option(command: F) -> F:
+    """`--scenarios DIR` in place of the bundled suite."""
+    return click.option(
+        "--scenarios",
+        "scenarios_dir",
+        type=click.Path(path_type=Path),
+        metavar="DIR",
+        help="Folder of scenario files in place of the bundled ones.",
+    )(command)
+
+
+@click.command("gate")
+@click.argument("candidate", type=click.Path(path_type=Path))
+@config_options
+@scenarios_option
+@json_option
+def gate(
+    candidate: Path,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    json_path: str | None,
+) -> int:
+    """Check the deployment gates of the decision section in CANDIDATE.
+
+    The camera is that of the configuration (-c), for that is what the pole has. Ends with 1 when
+    a gate does not hold.
+    """
+    from bikeped.config.provenance import decision_hash
+    from bikeped.conformance.gates import all_hold, check
+
+    rest, own = _split(overrides)
+    decision = load_decision(candidate, own)
+    loaded = load_config(config_path, rest)
+    suite = _suite(loaded, scenarios_dir)
+    metrics = suite.measure(decision)
+    gates = check(metrics)
+    if json_path is not None:
+        write_json(
+            {
+                "candidate": str(candidate),
+                "decision_hash": decision_hash(decision),
+                "config_hash": loaded.hash,
+                "calibration_hash": loaded.calibration_hash,
+                "suite_hash": suite.hash,
+                "scenarios": len(suite.scenarios),
+                "gates": [g.as_dict() for g in gates],
+                "holds": all_hold(gates),
+                "metrics": metrics.as_dict(),
+            },
+            json_path,
+        )
+    _print_gates(f"{candidate} on {len(suite.scenarios)} scenarios", gates, json_path)
+    return 0 if all_hold(gates) else 1
+
+
+@click.command("promote")
+@click.argument("candidate", type=click.Path(path_type=Path))
+@config_options
+@scenarios_option
+@click.option(
+    "--trace",
+    type=click.Path(path_type=Path),
+    help="The optimiser's trace file that the candidate came from; its hash is kept.",
+)
+@json_option
+def promote(
+    candidate: Path,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    trace: Path | None,
+    json_path: str | None,
+) -> int:
+    """Write the decision section of CANDIDATE into the configuration, if all gates hold.
+
+    The file before it stays as FILE.bak; where the section came from goes into
+    FILE.provenance.json, which `bikeped run` checks. A candidate that fails a gate is refused:
+    nothing is written, the command ends with 1.
+    """
+    from bikeped.conformance.gates import all_hold, check
+    from bikeped.conformance.promote import promote as write
+    from bikeped.conformance.promote import provenance_record
+
+    rest, own = _split(overrides)
+    if rest:
+        raise ConfigError(
+            f"--set {rest[0]}: promote measures with the camera that the file names; change it "
+            "there (--set decision.KEY=VALUE changes the candidate)"
+        )
+    path = config_path or Path("config.yaml")
+    loaded = load_config(path)
+    decision = load_decision(candidate, own)
+    suite = _suite(loaded, scenarios_dir)
+    metrics = suite.measure(decision)
+    gates = check(metrics)
+    files = [("candidate", candidate)] + ([("trace", trace)] if trace is not None else [])
+    record = provenance_record(suite, decision, metrics, loaded, files)
+    _print_gates(f"{candidate} on {len(suite.scenarios)} scenarios", gates, json_path)
+    out = console(json_path)
+    if not all_hold(gates):
+        if json_path is not None:
+            write_json({"promoted": False, **record}, json_path)
+        out.print("Refused: nothing was written.", style="bold")
+        return 1
+    written = write(path, loaded, decision, record)
+    if json_path is not None:
+        write_json({"promoted": True, **record}, json_path)
+    out.print(f"Promoted into {escape(str(path))}; restart the service to make it hold.")
+    out.print(f"Before: {escape(written.backup.name)}; why: {escape(written.provenance.name)}")
+    return 0
+
+
+@click.command("contest")
+@config_options
+@scenarios_option
+@click.option(
+    "--scenario",
+    "added",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A further scenario; one with the name of another takes its place. May be repeated.",
+)
+@click.option(
+    "--truth",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Another ground-truth threshold: cpa_radius_m, stopping_margin, ttc_bound_s, braking.",
+)
+@click.option(
+    "--bound",
+    multiple=True,
+    metavar="KEY=LOW..HIGH",
+    help="A tighter bound: a decision parameter outside it is moved to its nearest end.",
+)
+@json_option
+def contest(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    added: tuple[Path, ...],
+    truth: tuple[str, ...],
+    bound: tuple[str, ...],
+    json_path: str | None,
+) -> int:
+    """Rerun the suite under a challenge and show what it changes.
+
+    Before is the configuration as it is (-c) on the suite as it is; after is with --set, --bound,
+    --truth and --scenario. Needs no camera, no model and no access to the pole.
+    """
+    from bikeped.conformance import contest as contesting
+    from bikeped.conformance.scenario import load_scenario
+    from bikeped.conformance.suite import DEFAULT_TRUTH
+
+    if not (overrides or added or truth or bound):
+        raise BikepedError(
+            "contest: nothing is contested; give --scenario FILE, --set decision.KEY=VALUE, "
+            "--truth KEY=VALUE or --bound KEY=LOW..HIGH"
+        )
+    loaded = load_config(config_path)
+    other = load_config(config_path, overrides)
+    before = _suite(loaded, scenarios_dir)
+    # Another camera sees otherwise; with the same one, what was seen is not computed again.
+    same_camera = not _split(overrides)[0]
+    after = before if same_camera else _suite(other, scenarios_dir)
+    if added:
+        after = contesting.with_scenarios(after, [load_scenario(path) for path in added])
+    if truth:
+        after = after.with_truth(contesting.parse_truth(DEFAULT_TRUTH, truth))
+    decision = contesting.apply_bounds(other.config.decision, bound)
+    found = contesting.contest(before, loaded.config.decision, after, decision)
+    command = _command_line(config_path, overrides, scenarios_dir, added, truth, bound)
+    if json_path is not None:
+        write_json({"command": command, **found.as_dict()}, json_path)
+    _print_contest(found.as_dict(), command, json_path)
+    return 0
+
+
+@click.command("register")
+@config_options
+@scenarios_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE.md",
+    help="Write the register as Markdown.",
+)
+@json_option
+def register(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    out: Path | None,
+    json_path: str | None,
+) -> int:
+    """Write the residual-risk register of the configuration's decision."""
+    from bikeped.conformance.register import build
+
+    loaded = load_config(config_path, overrides)
+    found = build(_suite(loaded, scenarios_dir), loaded.config.decision)
+    if json_path is not None:
+        write_json({"config_hash": loaded.hash, **found.as_dict()}, json_path)
+    if out is not None:
+        write_whole(out, found.markdown())
+    _print_register(found.as_dict(), json_path)
+    return 0
+
+
+@click.command("plot")
+@config_options
+@scenarios_option
+@click.option("--scenario", "name", metavar="NAME", help="Only this scenario.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="Folder for the pictures; it is made.",
+)
+@json_option
+def plot(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    name: str | None,
+    out: Path,
+    json_path: str | None,
+) -> int:
+    """Draw each scenario: a strip over time and a plan from above."""
+    from bikeped.conformance.figure_style import require_matplotlib
+    from bikeped.conformance.plan import draw_plan
+    from bikeped.conformance.strip import draw_strip
+
+    require_matplotlib()
+    loaded = load_config(config_path, overrides)
+    suite = _suite(loaded, scenarios_dir)
+    if name is not None and name not in suite.names:
+        import difflib
+
+        near = difflib.get_close_matches(name, suite.names, 1)
+        mend = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(suite.names)}"
+        raise BikepedError(f"--scenario {name}: no scenario of this name; {mend}")
+    indices = [i for i, n in enumerate(suite.names) if name is None or n == name]
+    _make_folder(out)
+    files: list[Path] = []
+    with progress_bar("drawing", len(indices)) as tell:
+        for done, index in enumerate(indices, 1):
+            files += draw_strip(suite, loaded.config.decision, index, out)
+            files += draw_plan(suite, loaded.config.decision, index, out)
+            tell(done)
+    if json_path is not None:
+        write_json({"files": [str(path) for path in files]}, json_path)
+    console(json_path).print(
+        f"{len(files)} files of {len(indices)} scenarios in {escape(str(out))}"
+    )
+    return 0
+
+
+def _suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
+    from bikeped.conformance.scenario import bundled_folder, load_scenarios
+    from bikeped.conformance.suite import Suite
+
+    return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
+
+
+def _split(overrides: tuple[str, ...]) -> tuple[list[str], list[str]]:
+    """Overrides of the camera and the rest, and those of the decision."""
+    own = [o for o in overrides if o.strip().startswith("decision.")]
+    return [o for o in overrides if o not in own], own
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BikepedError(
+            f"--out {folder}: cannot be made ({error.strerror}); choose another folder"
+        ) from error
+
+
+def _command_line(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    added: tuple[Path, ...],
+    truth: tuple[str, ...],
+    bound: tuple[str, ...],
+) -> str:
+    """What somebody else types to get the same."""
+    words = ["bikeped", "conformance", "contest"]
+    words += ["-c", str(config_path)] if config_path is not None else []
+    words += ["--scenarios", str(scenarios_dir)] if scenarios_dir is not None else []
+    for flag, values in (
+        ("--scenario", added),
+        ("--set", overrides),
+        ("--truth", truth),
+        ("--bound", bound),
+    ):
+        for value in values:
+            words += [flag, str(value)]
+    return shlex.join(words)
+
+
+def _print_gates(title: str, gates: list[Gate], json_path: str | None) -> None:
+    table = RichTable(title=escape(title), title_justify="left")
+    for column in ("Gate", "Required", "Measured", "Holds"):
+        table.add_column(column)
+    for g in gates:
+        table.add_row(g.name, g.rule, g.say(g.measured), "yes" if g.holds else "[bold]NO[/bold]")
+    out = console(json_path)
+    out.print(table)
+    failed = [
+        f"{g.name.lower()} {g.say(g.measured)}, required {g.rule}" for g in gates if not g.holds
+    ]
+    out.print("Fails: " + "; ".join(failed) if failed else "All gates hold.")
+
+
+def _print_register(data: dict[str, Any], json_path: str | None) -> None:
+    """Short: the reasons are in the Markdown and the JSON."""
+    out = console(json_path)
+    table = RichTable(title="Residual risks", title_justify="left")
+    for column in ("Failure mode", "Simulated", "Field-blocking"):
+        table.add_column(column)
+    for hazard in data["hazards"]:
+        table.add_row(hazard["hazard"], hazard["coverage"], hazard["field_blocking"])
+    out.print(table)
+    table = RichTable(title="Scenarios", title_justify="left")
+    for column in ("Scenario", "Sens. %", "Spec. %", "SevFN %", "Budget s", "Remark"):
+        table.add_column(column, justify="left" if column in ("Scenario", "Remark") else "right")
+    for row in data["scenarios"]:
+        table.add_row(
+            escape(row["scenario"]),
+            *(_bare(row[k], "%") for k in ("sensitivity", "specificity", "sev_fn")),
+            _bare(row["min_warning_budget_s"], "s"),
+            escape(row["remark"]),
+        )
+    out.print(table)
+
+
+def _print_contest(data: dict[str, Any], command: str, json_path: str | None) -> None:
+    before, after = data["before"], data["after"]
+    out = console(json_path)
+    totals = RichTable(title="Totals", title_justify="left")
+    for column in ("Figure", "Before", "After"):
+        totals.add_column(column, justify="left" if column == "Figure" else "right")
+    for label, key, unit in (
+        ("Sensitivity", "sensitivity", "%"),
+        ("Specificity", "specificity", "%"),
+        ("SevFN", "sev_fn", "%"),
+        ("Fatigue", "fatigue", "%"),
+        ("Contact sensitivity", "contact_sensitivity", "%"),
+        ("Mean warning budget", "mean_warning_budget_s", "s"),
+    ):
+        totals.add_row(label, *(_figure(side["totals"][key], unit) for side in (before, after)))
+    gates = [
+        ", ".join(g["name"].lower() for g in s["gates"] if not g["holds"]) for s in (before, after)
+    ]
+    totals.add_row("Gates", *("all hold" if not g else f"fails: {g}" for g in gates))
+    out.print(totals)
+    changed = {c["scenario"]: c for c in data["changed"]}
+    if changed:
+        out.print(_changed_table(before, after, changed))
+    same = len(after["by_scenario"]) - len(changed)
+    out.print(f"{len(changed)} scenarios changed, {same} are as before.")
+    out.print(f"To repeat: {escape(command)}")
+
+
+def _changed_table(
+    before: dict[str, Any], after: dict[str, Any], changed: dict[str, dict[str, Any]]
+) -> RichTable:
+    """By scenario: frames whose state and whose truth changed, and figures before and after."""
+    table = RichTable(title="What changed, before > after", title_justify="left")
+    for column in ("Scenario", "State", "Truth", "ALERT %", "Sens. %", "SevFN %", "Min budget s"):
+        table.add_column(column, justify="left" if column == "Scenario" else "right")
+    for name, entry in changed.items():
+        sides = [s["by_scenario"][name] for s in (before, after) if name in s["by_scenario"]]
+        figures = [
+            " > ".join(_bare(value(side), unit) for side in sides)
+            for value, unit in (
+                (lambda side: side["states"]["ALERT"], "%"),
+                (lambda side: side["sensitivity"], "%"),
+                (lambda side: side["sev_fn"], "%"),
+                (lambda side: side["min_warning_budget_s"], "s"),
+            )
+        ]
+        if "frames_state" in entry:
+            frames = [str(entry["frames_state"]), str(entry["frames_truth"])]
+        else:
+            frames = [entry["what"].removesuffix(" scenario"), ""]
+        table.add_row(escape(name), *frames, *figures)
+    return table
+
+
+def _bare(value: float | None, unit: str) -> str:
+    if value is None:
+        return "-"
+    return f"{100 * value:.1f}" if unit == "%" else f"{value:.2f}"
+
+
+def _figure(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{_bare(value, unit)} {unit}"

@@ -1,0 +1,79 @@
+"""What is shown now: one place that tells light, speaker and telemetry the same signal."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Protocol
+
+from bikeped.feedback import OFF, LightDriver, SignalLogic, Speaker
+from bikeped.service.seldom import Seldom
+from bikeped.types import Decision, Signal
+
+log = logging.getLogger(__name__)
+
+STOPPED = "OFF: the service was stopped."
+
+
+class SignalListener(Protocol):
+    """Hears of every signal."""
+
+    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+        """What the light shows now, why, and the newest decision; with every frame and every tick.
+
+        Must not block.
+        """
+
+
+class Announcer:
+    """Lets `logic` choose the signal and tells everybody. The light comes first."""
+
+    def __init__(
+        self,
+        logic: SignalLogic,
+        light: LightDriver | None = None,
+        speaker: Speaker | None = None,
+        listeners: Sequence[SignalListener] = (),
+    ) -> None:
+        self._logic, self._light, self._speaker = logic, light, speaker
+        self._listeners = tuple(listeners)
+        self._decision: Decision | None = None
+        self._seldom = Seldom(log)
+        self.shown: Signal | None = None
+
+    def step(self, now_s: float, decision: Decision | None, faults: tuple[str, ...] = ()) -> Signal:
+        """Shows what `decision` (None: no new one) and `faults` lead to at `now_s`."""
+        if decision is not None:
+            self._decision = decision
+        signal = self._logic.step(now_s, None if decision is None else decision.state, faults)
+        if signal.name == "FAULT" or self._decision is None:
+            self._tell(signal, "; ".join(signal.faults))
+        else:
+            self._tell(signal, self._decision.sentence)
+        return signal
+
+    def off(self) -> None:
+        """Dark: nobody watches any more."""
+        self._tell(OFF, STOPPED)
+
+    def refresh(self) -> None:
+        """Shows the same once more, so that the light does not take the service for dead."""
+        if self._light is not None and self.shown is not None:
+            self._light.show(self.shown)
+
+    def _tell(self, signal: Signal, sentence: str) -> None:
+        if self._light is not None:
+            self._light.show(signal)
+        if self._speaker is not None:
+            self._speaker.play(signal.sound)
+        if self.shown is None or self.shown.name != signal.name:
+            log.info("%s: %s", signal.name, sentence)
+        self.shown = signal
+        for listener in self._listeners:
+            self._tell_listener(listener, signal, sentence)
+
+    def _tell_listener(self, listener: SignalListener, signal: Signal, sentence: str) -> None:
+        try:
+            listener.signal(signal, sentence, self._decision)
+        except Exception as error:  # noqa: BLE001 - telemetry must not darken the light
+            self._seldom.failure("listener", error)

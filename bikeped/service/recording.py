@@ -1,0 +1,147 @@
+"""What a replay leaves behind: the tally, the event file, the overlay video."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from bikeped.service.judge import Judge
+from bikeped.service.loop import Outcome
+from bikeped.service.telemetry import line_of
+from bikeped.telemetry.events import EventWriter
+from bikeped.telemetry.messages import EventHeader
+from bikeped.types import Kind, State
+from bikeped.view import Moment, VideoSink, compose, ground_projector
+
+OVERLAY_SIZE = (1600, 720)
+
+
+@dataclass
+class Tally:
+    """What a replay adds up: states, kinds, alert episodes."""
+
+    states: dict[str, int] = field(default_factory=dict)
+    tracks: dict[str, set[int]] = field(default_factory=dict)
+    detections: int = 0
+    not_on_ground: int = 0
+    alerts: list[dict[str, Any]] = field(default_factory=list)
+    first_s: float | None = None
+    last_s: float = 0.0
+    _alerting: bool = False
+
+    async def frame(self, outcome: Outcome) -> None:
+        frame, judgement = outcome.picture.frame, outcome.judgement
+        if self.first_s is None:
+            self.first_s = frame.captured_s
+        self.last_s = frame.captured_s
+        self.detections += len(outcome.detections)
+        self.not_on_ground += judgement.not_on_ground
+        decision = judgement.decision
+        self.states[decision.state.name] = self.states.get(decision.state.name, 0) + 1
+        for key, kind in zip(judgement.tracks.id.tolist(), judgement.tracks.kind, strict=True):
+            self.tracks.setdefault(Kind(kind).label, set()).add(key)
+        alerting = decision.state is State.ALERT
+        if alerting and not self._alerting:
+            self.alerts.append(
+                {
+                    "t": round(frame.captured_s - self.first_s, 3),
+                    "frame": frame.number,
+                    "sentence": decision.sentence,
+                    "frames": 0,
+                }
+            )
+        if alerting:
+            self.alerts[-1]["frames"] += 1
+        self._alerting = alerting
+
+
+class EventFile:
+    """The event file of a replay; it appears when it is whole, and not at all after an error."""
+
+    def __init__(self, path: Path, header: EventHeader) -> None:
+        self._writer = EventWriter(path, header)
+        self._first_s: float | None = None
+
+    async def frame(self, outcome: Outcome) -> None:
+        if self._first_s is None:
+            self._first_s = outcome.picture.frame.captured_s
+        self._writer.write(line_of(outcome, self._first_s))
+
+    def __enter__(self) -> EventFile:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+        if error is not None:
+            self._writer.partial_path.unlink(missing_ok=True)
+
+
+class OverlayVideo:
+    """The overlay video of a replay: drawn in a thread, while the next frame is looked at."""
+
+    def __init__(self, sink: VideoSink, judge: Judge) -> None:
+        self._sink, self._judge = sink, judge
+        self._fov_deg = math.degrees(2 * judge.camera.lens.max_theta_rad)
+        self._drawing: asyncio.Task[None] | None = None
+        self._first_s: float | None = None
+
+    async def frame(self, outcome: Outcome) -> None:
+        await self.wait()
+        frame, judgement = outcome.picture.frame, outcome.judgement
+        if self._first_s is None:
+            self._first_s = frame.captured_s
+        moment = Moment(
+            detections=outcome.detections,
+            tracks=judgement.tracks,
+            decision=judgement.decision,
+            frame_number=frame.number,
+            time_s=frame.captured_s - self._first_s,
+            latency_s=outcome.latency_ms["total"] / 1e3,
+            history={k: np.asarray(v) for k, v in self._judge.tracker.history().items()},
+        )
+        framing = self._judge.framing_of(frame.width, frame.height)
+        projector = ground_projector(self._judge.camera, framing)
+
+        def draw() -> None:
+            self._sink.write(
+                compose(
+                    outcome.picture.rgb,
+                    moment,
+                    self._sink.size,
+                    frame_width=frame.width,
+                    ground_to_frame=projector,
+                    fov_deg=self._fov_deg,
+                    heading_deg=self._judge.camera.heading_deg,
+                )
+            )
+
+        self._drawing = asyncio.create_task(asyncio.to_thread(draw))
+
+    async def wait(self) -> None:
+        """Until the frame in hand is drawn; raises what went wrong."""
+        task, self._drawing = self._drawing, None
+        if task is not None:
+            await task
+
+
+class Progress:
+    """Tells how many frames are done."""
+
+    def __init__(self, tell: Callable[[int], None]) -> None:
+        self._tell, self._frames = tell, 0
+
+    async def frame(self, outcome: Outcome) -> None:
+        self._frames += 1
+        self._tell(self._frames)

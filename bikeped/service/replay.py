@@ -1,0 +1,236 @@
+"""`replay`: a recording through the very loop that `run` has."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal as signals
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bikeped.capture import FrameSource, Paced, open_source
+from bikeped.config import LoadedConfig
+from bikeped.errors import BikepedError, GeometryError
+from bikeped.feedback import LightDriver, SignalLogic, SimulatedLight
+from bikeped.service.announcer import Announcer
+from bikeped.service.feed import RecordedFeed
+from bikeped.service.health import tell_health
+from bikeped.service.judge import Judge
+from bikeped.service.loop import Loop, Output
+from bikeped.service.parts import header_of, load_eye, start_publisher
+from bikeped.service.recording import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
+from bikeped.service.telemetry import Telemetry
+from bikeped.service.vision import Eye, Vision
+from bikeped.telemetry.latency import StageTimes
+from bikeped.telemetry.messages import Part
+from bikeped.view import VideoSink
+
+log = logging.getLogger(__name__)
+
+#: The percentiles of a replay are those of all its frames, up to this many (nearly an hour).
+REMEMBER = 100_000
+#: So many detections tell whether the camera settings fit the recording.
+ENOUGH_DETECTIONS = 20
+
+
+@dataclass(frozen=True)
+class ReplayFiles:
+    """What a replay leaves behind; None leaves it out."""
+
+    events: Path | None = None
+    overlay: Path | None = None
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """What a replay found."""
+
+    tally: Tally
+    times: StageTimes
+    frames: int
+    undecodable: int
+    wall_s: float
+    config_hash: str
+    detector: str
+    warnings: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """The summary, for `--json`."""
+        tally = self.tally
+        return {
+            "frames": self.frames,
+            "undecodable": self.undecodable,
+            "duration_s": round(tally.last_s - (tally.first_s or 0.0), 3),
+            "states": dict(sorted(tally.states.items())),
+            "tracks": {kind: len(ids) for kind, ids in sorted(tally.tracks.items())},
+            "alerts": tally.alerts,
+            "detections": tally.detections,
+            "not_on_ground": tally.not_on_ground,
+            "warnings": list(self.warnings),
+            "detector": self.detector,
+            "config_hash": self.config_hash,
+            "frames_per_second": round(self.frames / max(self.wall_s, 1e-9), 2),
+            "latency_ms": {
+                stage: {name: round(value, 3) for name, value in row.items()}
+                for stage, row in self.times.percentiles().items()
+            },
+        }
+
+
+def replay(
+    loaded: LoadedConfig,
+    recording: str,
+    *,
+    eye: Eye | None = None,
+    files: ReplayFiles = ReplayFiles(),
+    realtime: bool = False,
+    mqtt: bool = True,
+    progress: Callable[[int], None] | None = None,
+) -> ReplayResult:
+    """Runs a recording through the loop; raises BikepedError with one line that says the mend.
+
+    `eye` in place of the configured model belongs to the recording, so its size is no surprise.
+    """
+    camera = loaded.config.camera
+    source = open_source(
+        recording, width=camera.width, height=camera.height, fps=camera.fps, fourcc=camera.fourcc
+    )
+    with contextlib.closing(source):
+        if source.live:
+            raise BikepedError(f"{source.name}: is a camera, not a recording; use bikeped run")
+        judge = Judge(loaded)
+        try:
+            judge.framing_of(source.width, source.height)
+        except GeometryError as error:
+            raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
+        warnings = [] if eye is not None else _size_warnings(loaded, source)
+        looking = eye if eye is not None else load_eye(loaded)
+        return asyncio.run(
+            _replay(
+                loaded,
+                Paced(source) if realtime else source,
+                judge,
+                looking,
+                files,
+                mqtt and loaded.config.mqtt.enabled,
+                [] if progress is None else [Progress(progress)],
+                warnings,
+            )
+        )
+
+
+async def _replay(
+    loaded: LoadedConfig,
+    source: FrameSource,
+    judge: Judge,
+    eye: Eye,
+    files: ReplayFiles,
+    mqtt: bool,
+    outputs: list[Output],
+    warnings: list[str],
+) -> ReplayResult:
+    config = loaded.config
+    tally = Tally()
+    async with contextlib.AsyncExitStack() as stack:
+        publisher = await start_publisher(loaded, stack) if mqtt else None
+        telemetry = Telemetry(loaded, judge, publisher=publisher, remember=REMEMBER)
+        outputs = [tally, telemetry, *outputs]
+        if files.events is not None:
+            outputs.append(stack.enter_context(EventFile(files.events, header_of(loaded, eye))))
+        if files.overlay is not None:
+            fps = source.fps if source.fps > 0 else 30.0
+            overlay = OverlayVideo(
+                stack.enter_context(VideoSink(files.overlay, fps, OVERLAY_SIZE)), judge
+            )
+            outputs.append(overlay)
+            stack.push_async_callback(overlay.wait)
+        # A recording at a desk must not move the lamps of a crossing.
+        light = LightDriver(SimulatedLight, fault_blink_hz=config.feedback.fault_blink_hz)
+        light.start()
+        stack.push_async_callback(asyncio.to_thread, light.close)
+        loop = Loop(
+            feed=RecordedFeed(source),
+            vision=Vision(eye, OVERLAY_SIZE[0] if files.overlay is not None else 0),
+            judge=judge,
+            announcer=Announcer(
+                SignalLogic.from_config(config.feedback), light, listeners=(telemetry,)
+            ),
+            outputs=outputs,
+        )
+        part = Part(ok=True, detail="simulated")
+        telling = asyncio.create_task(
+            tell_health(
+                telemetry, loop, lambda: telemetry.health(loop, part), config.mqtt.health_interval_s
+            )
+        )
+        began = time.perf_counter()
+        try:
+            with _stop_on_signals(loop):
+                await loop.run()
+        finally:
+            telling.cancel()
+        wall_s = time.perf_counter() - began
+        telemetry.publish_health(telemetry.health(loop, part))
+        if loop.counts.frames == 0:
+            raise BikepedError(
+                f"{source.name}: no frame could be read ({loop.counts.undecodable} did not "
+                "decode); check the recording"
+            )
+    warnings.extend(_ground_warnings(loaded, tally))
+    return ReplayResult(
+        tally=tally,
+        times=telemetry.times,
+        frames=loop.counts.frames,
+        undecodable=loop.counts.undecodable,
+        wall_s=wall_s,
+        config_hash=loaded.hash,
+        detector=eye.name,
+        warnings=tuple(warnings),
+    )
+
+
+def _size_warnings(loaded: LoadedConfig, source: FrameSource) -> list[str]:
+    camera = loaded.config.camera
+    if (source.width, source.height) == (camera.width, camera.height):
+        return []
+    text = (
+        f"{source.name}: frames are {source.width} x {source.height}, taken as scaled copies of "
+        f"{loaded.source}'s {camera.width} x {camera.height}; were they made by another camera, "
+        "set camera.width, camera.height and its lens"
+    )
+    log.warning("%s", text)
+    return [text]
+
+
+def _ground_warnings(loaded: LoadedConfig, tally: Tally) -> list[str]:
+    if tally.detections < ENOUGH_DETECTIONS or 2 * tally.not_on_ground <= tally.detections:
+        return []
+    text = (
+        f"{tally.not_on_ground} of {tally.detections} detections end above the horizon or outside "
+        f"the image circle: {loaded.source} is for another camera or mounting; set the camera "
+        "section (projection, fov_deg, radius_px, pitch_deg) to the one that recorded this"
+    )
+    log.warning("%s", text)
+    return [text]
+
+
+@contextlib.contextmanager
+def _stop_on_signals(loop: Loop) -> Iterator[None]:
+    """SIGTERM and Ctrl-C end a replay after the frame in hand, with whole files."""
+    running = asyncio.get_running_loop()
+    numbers = (signals.SIGTERM, signals.SIGINT)
+    try:
+        for number in numbers:
+            running.add_signal_handler(number, loop.stop)
+    except (RuntimeError, ValueError):  # not the main thread: nobody to signal
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number in numbers:
+            running.remove_signal_handler(number)

@@ -1,0 +1,213 @@
+"""What the loop tells the world: MQTT, metrics, audit log, latency figures, health."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+import msgspec
+
+from bikeped import __version__
+from bikeped.config import LoadedConfig
+from bikeped.service.judge import Judge
+from bikeped.service.loop import Loop, Outcome
+from bikeped.telemetry.audit import AuditLog
+from bikeped.telemetry.latency import StageTimes
+from bikeped.telemetry.messages import (
+    Counters,
+    EventLine,
+    HealthMessage,
+    Part,
+    ShownState,
+    encode,
+    event_line,
+    health_message,
+    state_message,
+    tracks_message,
+)
+from bikeped.telemetry.metrics import Metrics
+from bikeped.telemetry.mqtt import MqttPublisher
+from bikeped.types import Decision, Signal, State
+
+
+class Telemetry:
+    """MQTT, metrics, audit log and latency figures. Nothing here waits for anybody.
+
+    `remember`: over how many frames the percentiles are taken.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedConfig,
+        judge: Judge,
+        *,
+        publisher: MqttPublisher | None = None,
+        audit: AuditLog | None = None,
+        metrics: Metrics | None = None,
+        remember: int = 900,
+        wall_clock: Callable[[], float] = time.time,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._loaded, self._judge = loaded, judge
+        self._mqtt, self._audit, self._metrics = publisher, audit, metrics
+        self._wall, self._clock = wall_clock, clock
+        self.times = StageTimes(remember)
+        self.alerts = 0
+        self._shown: tuple[str, tuple[str, ...]] | None = None
+        self._next_tracks_s = -math.inf
+        self._started_s = clock()
+        self._first_captured_s: float | None = None
+        self._recent: deque[float] = deque(maxlen=240)  # when frames were judged
+        self._last: Outcome | None = None
+        self._signal: Signal | None = None
+        self._counted: dict[str, int] = {}
+
+    async def frame(self, outcome: Outcome) -> None:
+        self._last = outcome
+        now_s = self._clock()
+        self._recent.append(now_s)
+        self.times.add(outcome.latency_ms)
+        if self._metrics is not None:
+            self._metrics.frame(
+                detections=outcome.detections,
+                tracks=outcome.judgement.tracks,
+                latency_ms=outcome.latency_ms,
+            )
+        if self._audit is not None:
+            if self._first_captured_s is None:
+                self._first_captured_s = outcome.picture.frame.captured_s
+            self._audit.write(line_of(outcome, self._first_captured_s))
+        if self._mqtt is not None and now_s >= self._next_tracks_s:
+            self._next_tracks_s = self._due(now_s)
+            message = tracks_message(
+                unix_s=self._wall() - outcome.latency_ms["capture_age"] / 1e3,
+                frame_number=outcome.picture.frame.number,
+                state=_shown(outcome.signal),
+                tracks=outcome.judgement.tracks,
+                history=self._judge.tracker.history(),
+            )
+            self._mqtt.publish("tracks", encode(message))
+
+    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+        self._signal = signal
+        if self._metrics is not None:
+            self._metrics.shown(_shown(signal))
+        shown = (signal.name, signal.faults if signal.name == "FAULT" else ())
+        before, self._shown = self._shown, shown
+        if shown == before:
+            return
+        if signal.name == "ALERT":
+            self.alerts += 1
+        if self._mqtt is None:
+            return
+        message = state_message(
+            decision or Decision(0.0, State.IDLE, sentence),
+            since_unix_s=self._wall(),
+            config_hash=self._loaded.hash,
+            shown=_shown(signal),
+            sentence=sentence,
+        )
+        self._mqtt.publish("state", encode(message), retain=True, qos=self._loaded.config.mqtt.qos)
+
+    def fps(self) -> float:
+        """Frames judged per second, over the last two seconds."""
+        now_s = self._clock()
+        return sum(now_s - at_s <= 2.0 for at_s in self._recent) / 2.0
+
+    def health(self, loop: Loop, light: Part, faults: tuple[str, ...] = ()) -> HealthMessage:
+        """The health message now; `faults` are those that the light does not show."""
+        signal = self._signal
+        faults = (*(signal.faults if signal else ()), *faults)
+        camera = [fault for fault in faults if fault.startswith(("camera", "geometry"))]
+        detector = [fault for fault in faults if fault.startswith("detector")]
+        status = self._mqtt.status if self._mqtt is not None else None
+        age_s = loop.frame_age_s()
+        age_ms = None if age_s is None else age_s * 1e3
+        if age_ms is None and self._last is not None:
+            age_ms = self._last.latency_ms["capture_age"]
+        return health_message(
+            unix_s=self._wall(),
+            state=_shown(signal) if signal else "FAULT",
+            version=__version__,
+            config_hash=self._loaded.hash,
+            uptime_s=self._clock() - self._started_s,
+            fps=self.fps(),
+            latency_ms=self.times.percentiles(),
+            camera=Part(ok=not camera, detail="; ".join(camera) or "frames arrive"),
+            capture_age_ms=age_ms,
+            detector=Part(ok=not detector, detail="; ".join(detector) or "answers"),
+            light=light,
+            faults=faults,
+            counters=Counters(
+                frames=loop.counts.frames,
+                dropped=loop.dropped(),
+                undecodable=loop.counts.undecodable,
+                alerts=self.alerts,
+                mqtt_dropped=status.dropped if status else 0,
+                audit_dropped=self._audit.dropped if self._audit else 0,
+            ),
+        )
+
+    def publish_health(self, message: HealthMessage) -> None:
+        """Sends a health message where there is a broker."""
+        if self._mqtt is not None:
+            qos = self._loaded.config.mqtt.qos
+            self._mqtt.publish("health", encode(message), retain=True, qos=qos)
+
+    def measure(self, loop: Loop, light_errors: int = 0) -> None:
+        """Brings the metrics that no single frame tells up to date."""
+        metrics = self._metrics
+        if metrics is None:
+            return
+        status = self._mqtt.status if self._mqtt is not None else None
+        metrics.rates(
+            fps=self.fps(),
+            capture_age_s=loop.frame_age_s(),
+            faults=len(self._signal.faults) if self._signal else 0,
+        )
+        metrics.queues(
+            mqtt_connected=bool(status and status.connected),
+            mqtt_dropped=status.dropped if status else 0,
+            audit_dropped=self._audit.dropped if self._audit else 0,
+        )
+        metrics.dropped("newer", self._since("dropped", loop.dropped()))
+        metrics.undecodable(self._since("undecodable", loop.counts.undecodable))
+        for _ in range(self._since("light", light_errors)):
+            metrics.light_fault()
+
+    def _since(self, name: str, total: int) -> int:
+        """How much a total has grown since it was last asked for."""
+        before, self._counted[name] = self._counted.get(name, 0), total
+        return max(0, total - before)
+
+    def _due(self, now_s: float) -> float:
+        """The next due time on a fixed grid, so that 0.1 s means ten a second on average."""
+        interval_s = self._loaded.config.mqtt.publish_interval_s
+        # After a pause there is nothing to catch up with.
+        return max(self._next_tracks_s + interval_s, now_s + interval_s / 2)
+
+
+def line_of(outcome: Outcome, first_captured_s: float) -> EventLine:
+    """The event line of an outcome."""
+    frame = outcome.picture.frame
+    return event_line(
+        t_s=frame.captured_s - first_captured_s,
+        frame=frame.number,
+        decision=outcome.judgement.decision,
+        tracks=outcome.judgement.tracks,
+        detections=outcome.detections,
+        latency_ms=outcome.latency_ms,
+        light=_shown(outcome.signal),
+    )
+
+
+def as_mapping(message: msgspec.Struct) -> Mapping[str, Any]:
+    """A message as plain keys and values, for the HTTP server."""
+    return cast(Mapping[str, Any], msgspec.to_builtins(message))
+
+
+def _shown(signal: Signal) -> ShownState:
+    return cast(ShownState, signal.name)
