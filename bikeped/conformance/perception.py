@@ -176,23 +176,30 @@ def trial_generator(seed: int, name: str, trial: int) -> np.random.Generator:
 def misses(
     recall: FloatArray, present: BoolArray, rng: np.random.Generator, burst: float | None = None
 ) -> BoolArray:
-    """Which detections [f, a] are missed.
+    """Which detections [f, a] of one trial are missed; see `lost`."""
+    return lost(rng.random(recall.shape), recall, present, burst)
+
+
+def lost(
+    draw: FloatArray, recall: FloatArray, present: BoolArray, burst: float | None = None
+) -> BoolArray:
+    """Which detections are missed; frames along the first axis, any number of trials and agents
+    along the others (`recall` and `present` broadcast against `draw`, uniform in 0..1).
 
     Independent with probability 1 - recall each; with `burst` (mean length B in frames) as
     Gilbert's two states per agent: recovery 1/B, onset (1 - recall)/(B recall), started in the
     stationary state. The onset cannot exceed 1: below a recall of 1/(1 + B) losses are denser.
     """
-    draw = rng.random(recall.shape)
     if burst is None:
         return np.asarray((draw >= recall) & present)
-    lost: BoolArray = np.zeros(recall.shape, np.bool_)
-    bad: BoolArray = np.zeros(recall.shape[1], np.bool_)
-    started: BoolArray = np.zeros(recall.shape[1], np.bool_)
+    missed: BoolArray = np.zeros(draw.shape, np.bool_)
+    bad: BoolArray = np.zeros(draw.shape[1:], np.bool_)
+    started: BoolArray = np.zeros(draw.shape[1:], np.bool_)
     onset = np.minimum((1 - recall) / (burst * np.maximum(recall, 1e-9)), 1.0)
-    for frame in range(len(recall)):
+    for frame in range(len(draw)):
         here = present[frame]
         moved = np.where(bad, draw[frame] >= 1 / burst, draw[frame] < onset[frame])
         bad = np.asarray(np.where(started, moved, draw[frame] >= recall[frame])) & here
         started |= here
-        lost[frame] = bad
-    return lost
+        missed[frame] = bad
+    return missed

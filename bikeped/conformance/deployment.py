@@ -1,0 +1,246 @@
+"""Where cameras stand and how they look: road widths, one or two poles, height and pitch.
+
+Definitions, section 11. What it leaves open is chosen so: the lens is equidistant with 220 degrees
+in the deployed camera's image circle (radius, optical centre and sensor window unchanged); the
+cyclist rides across the pedestrian's way in the middle of the road, so that both would be at
+(5, 0) at the same time, and rides on for 10 m; the pedestrian walks from kerb to kerb.
+
+Two cameras: an object is detected with probability 1 - (1 - AR1)(1 - AR2), at the position of the
+camera in whose image it is larger, in the first camera's ground frame.
+
+An object of which no corner is visible keeps its true position and the recall of the smallest
+objects (definitions, section 3). That flatters a camera that looks past the crossing, so every row
+also says what remains when such an object is never detected (`visible_only`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bikeped.config import DecisionConfig
+from bikeped.conformance.experiments import Progress, percent, quiet
+from bikeped.conformance.metrics import TruthFrames
+from bikeped.conformance.montecarlo import Observed, Plan, simulate_views, summaries
+from bikeped.conformance.perception import RecallModel, Seen, see
+from bikeped.conformance.scenario import SIZES_M, Agent, Scenario
+from bikeped.conformance.tables import Result, Table
+from bikeped.conformance.truth import judge_truth
+from bikeped.geometry import CameraPose, GroundCamera, Lens
+from bikeped.types import FloatArray
+
+FOOT_M = 0.3048
+WIDTHS_FT = (30, 40, 50, 60)
+MOUNTS = ((5.5, 0.0), (2.5, -40.0))  #: height m, pitch degrees
+HEIGHTS_M = tuple(1.5 + 0.5 * i for i in range(13))
+PITCHES_DEG = tuple(0.0 - 10 * i for i in range(10))
+FOV_DEG = 220.0
+PLACEMENT_WIDTH_FT = 40
+PLACEMENT_TRIALS = 20
+DEPLOYMENT_TRIALS = 200
+CROSSING_X_M = 5.0
+WALK_MPS = 1.3
+RIDE_MPS = 8.3
+RIDE_FROM_M = 20.0
+RIDE_ON_M = 10.0
+_SIZE = RecallModel("size")
+
+
+def road_scenario(width_ft: float) -> Scenario:
+    """The crossing of one road: both would be at (5, 0) at the same time."""
+    width = width_ft * FOOT_M
+    meet_s = width / 2 / WALK_MPS
+    start_s = meet_s - RIDE_FROM_M / RIDE_MPS
+    end_s = meet_s + RIDE_ON_M / RIDE_MPS
+    if start_s < 0:
+        raise ValueError(f"width_ft: {width_ft:g} is too narrow; use 21 or more")
+    walk = np.array([[0.0, CROSSING_X_M, -width / 2], [width / WALK_MPS, CROSSING_X_M, width / 2]])
+    ride = np.array(
+        [[start_s, CROSSING_X_M - RIDE_FROM_M, 0.0], [end_s, CROSSING_X_M + RIDE_ON_M, 0.0]]
+    )
+    agents = (
+        Agent(1, "pedestrian", walk, SIZES_M["pedestrian"]),
+        Agent(2, "cyclist", ride, SIZES_M["cyclist"]),
+    )
+    return Scenario(f"Road of {width_ft:g} ft", "standard", "warning", "bicycle", agents)
+
+
+def wide_camera(camera: GroundCamera, height_m: float, pitch_deg: float) -> GroundCamera:
+    """The deployed camera with a lens of 220 degrees, at another height and pitch."""
+    radius = float(camera.lens.radius(np.asarray(camera.lens.max_theta_rad)))
+    lens = Lens.from_circle("equidistant", radius, FOV_DEG)
+    return replace(camera, lens=lens, height_m=height_m, pitch_deg=pitch_deg, heading_deg=0.0)
+
+
+def poses(width_ft: float, cameras: int) -> tuple[CameraPose, ...]:
+    """One pole at the near kerb, or a second opposite, looking back."""
+    half = width_ft * FOOT_M / 2
+    near, far = CameraPose(CROSSING_X_M, -half, 90.0), CameraPose(CROSSING_X_M, half, 270.0)
+    return (near,) if cameras == 1 else (near, far)
+
+
+def observe(
+    scenario: Scenario,
+    camera: GroundCamera,
+    where: Sequence[CameraPose],
+    recall: RecallModel = _SIZE,
+    visible_only: bool = False,
+) -> Observed:
+    """What one camera, or several fused, could detect; see the module's text."""
+    seen = [see(scenario, camera, pose) for pose in where]
+    rates = [_recall(s, recall, visible_only) for s in seen]
+    xy, area = seen[0].observed_m, seen[0].area_px2
+    for pose, other in zip(where[1:], seen[1:], strict=True):
+        moved = where[0].world_to_ground(pose.ground_to_world(other.observed_m))
+        larger = other.area_px2 > area
+        xy = np.where(larger[..., None], moved, xy)
+        area = np.maximum(area, other.area_px2)
+    missed = np.prod([1 - rate for rate in rates], axis=0)
+    return Observed(scenario.name, xy, 1 - missed, seen[0].present, seen[0].kind)
+
+
+def _recall(seen: Seen, recall: RecallModel, visible_only: bool) -> FloatArray:
+    rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
+    return np.where(seen.area_px2 > 0, rate, 0.0) if visible_only else rate
+
+
+def _measured(
+    scenario: Scenario,
+    views: Sequence[tuple[GroundCamera, Sequence[CameraPose]]],
+    decision: DecisionConfig,
+    trials: int,
+    seed: int,
+    recall: RecallModel,
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """By view: summaries over trials by the definition, and with invisible objects undetected."""
+    truth = TruthFrames.join([judge_truth(scenario)])
+    observed = [
+        [observe(scenario, camera, where, recall, visible_only)]
+        for visible_only in (False, True)
+        for camera, where in views
+    ]
+    found = simulate_views(observed, truth, Plan(recall, None), {"": decision}, range(trials), seed)
+    told = [summaries(part[0][""]) for part in found]
+    return list(zip(told[: len(views)], told[len(views) :], strict=True))
+
+
+def deployment(
+    camera: GroundCamera,
+    decision: DecisionConfig,
+    trials: int = DEPLOYMENT_TRIALS,
+    seed: int = 0,
+    recall: RecallModel = _SIZE,
+    progress: Progress = quiet,
+) -> Result:
+    """Road widths, one camera and two, both mounts. Progress counts widths."""
+    cases = [(height, pitch, cameras) for height, pitch in MOUNTS for cameras in (1, 2)]
+    rows: list[dict[str, Any]] = []
+    for count, width in enumerate(WIDTHS_FT):
+        views = [(wide_camera(camera, h, p), poses(width, n)) for h, p, n in cases]
+        told = _measured(road_scenario(width), views, decision, trials, seed, recall)
+        rows += [
+            {
+                "width_ft": width,
+                "cameras": cameras,
+                "height_m": height,
+                "pitch_deg": pitch,
+                **usual,
+                "visible_only": visible,
+            }
+            for (height, pitch, cameras), (usual, visible) in zip(cases, told, strict=True)
+        ]
+        progress(count + 1)
+    rows.sort(key=lambda r: (-r["height_m"], r["cameras"], r["width_ft"]))
+    data = {"rows": rows, "trials": trials, "seed": seed, "recall": recall.mode, "fov_deg": FOV_DEG}
+    table = Table(
+        "deployment",
+        "Road widths, one camera and two",
+        (
+            "height, m",
+            "pitch, degrees",
+            "cameras",
+            "width, ft",
+            "sensitivity, %",
+            "from, %",
+            "to, %",
+            "specificity, %",
+            "visible only: sensitivity, %",
+        ),
+        [
+            (
+                row["height_m"],
+                row["pitch_deg"],
+                row["cameras"],
+                row["width_ft"],
+                percent(row["sensitivity"]["mean"]),
+                percent(row["sensitivity"]["low"]),
+                percent(row["sensitivity"]["high"]),
+                percent(row["specificity"]["mean"]),
+                percent(row["visible_only"]["sensitivity"]["mean"]),
+            )
+            for row in rows
+        ],
+        f"{trials} trials; from and to: 95 % confidence interval of the mean; visible only: what "
+        "no camera can see is never detected",
+    )
+    return Result("deployment", data, (table,))
+
+
+def placement(
+    camera: GroundCamera,
+    decision: DecisionConfig,
+    trials: int = PLACEMENT_TRIALS,
+    seed: int = 0,
+    recall: RecallModel = _SIZE,
+    progress: Progress = quiet,
+) -> Result:
+    """Height by pitch on a road of 40 ft, one camera. Progress counts heights."""
+    scenario = road_scenario(PLACEMENT_WIDTH_FT)
+    where = poses(PLACEMENT_WIDTH_FT, 1)
+    grids: dict[str, list[list[float | None]]] = {
+        "sensitivity": [],
+        "specificity": [],
+        "visible_only_sensitivity": [],
+    }
+    for count, height in enumerate(HEIGHTS_M):
+        views = [(wide_camera(camera, height, pitch), where) for pitch in PITCHES_DEG]
+        told = _measured(scenario, views, decision, trials, seed, recall)
+        grids["sensitivity"].append([usual["sensitivity"]["mean"] for usual, _ in told])
+        grids["specificity"].append([usual["specificity"]["mean"] for usual, _ in told])
+        grids["visible_only_sensitivity"].append([v["sensitivity"]["mean"] for _, v in told])
+        progress(count + 1)
+    data = {
+        "height_m": list(HEIGHTS_M),
+        "pitch_deg": list(PITCHES_DEG),
+        **grids,
+        "width_ft": PLACEMENT_WIDTH_FT,
+        "trials": trials,
+        "seed": seed,
+        "recall": recall.mode,
+        "fov_deg": FOV_DEG,
+    }
+    columns = ("height, m", *(f"{pitch:g}\N{DEGREE SIGN}, %" for pitch in PITCHES_DEG))
+    tables = tuple(
+        Table(
+            name,
+            title,
+            columns,
+            [
+                (height, *(percent(value) for value in row))
+                for height, row in zip(HEIGHTS_M, grids[grid], strict=True)
+            ],
+            f"{trials} trials a cell",
+        )
+        for name, title, grid in (
+            ("placement", "Sensitivity by height and pitch", "sensitivity"),
+            (
+                "placement_visible_only",
+                "Sensitivity by height and pitch, what is not visible never detected",
+                "visible_only_sensitivity",
+            ),
+        )
+    )
+    return Result("placement", data, tables)

@@ -1,0 +1,342 @@
+"""The experiments that need no chance: scenario table, comparison, errors, truth, braking.
+
+Each is a function from a suite to a `Result`: `data` in plain JSON with exact figures (null where
+there is none), tables for people in per cent with one decimal.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bikeped import __version__
+from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.conformance.metrics import Metrics, measure, number
+from bikeped.conformance.perception import error_table, localise
+from bikeped.conformance.scenario import SIZES_M
+from bikeped.conformance.suite import CONFIGURATIONS, Suite, camera_json, compare, compare_json
+from bikeped.conformance.tables import Cell, Result, Table
+from bikeped.conformance.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, TruthSettings
+from bikeped.errors import ScenarioError
+from bikeped.types import BoolArray, State
+
+Progress = Callable[[int], None]
+
+#: The metrics of the short tables: key, column, factor, decimals.
+SHOWN = (
+    ("sensitivity", "sensitivity, %", 100.0, 1),
+    ("specificity", "specificity, %", 100.0, 1),
+    ("sev_fn", "SevFN, %", 100.0, 1),
+    ("fatigue", "fatigue, %", 100.0, 1),
+    ("mean_warning_budget_s", "mean budget, s", 1.0, 2),
+    ("contact_sensitivity", "contact sensitivity, %", 100.0, 1),
+)
+SHOWN_COLUMNS = tuple(column for _, column, _, _ in SHOWN)
+
+#: Thresholds of the ground truth that are varied one at a time (paper, table 4).
+CPA_RADII_M = (3.0, 5.0, 7.0)
+STOPPING_MARGINS = (0.6, 0.8, 1.0)
+TTC_BOUNDS_S = (2.0, 3.0, 4.0)
+MAP_STEP_M = 0.5
+MAP_REACH_M = 25.0
+
+
+def quiet(done: int) -> None:
+    """Progress that nobody watches."""
+
+
+def percent(value: float | None) -> float | None:
+    """A share for a table: per cent, one decimal."""
+    return None if value is None else round(100 * value, 1)
+
+
+def shown(metrics: Mapping[str, Any]) -> tuple[Cell, ...]:
+    """The cells of `SHOWN` from a metrics dictionary."""
+    return tuple(
+        None if metrics.get(key) is None else round(metrics[key] * factor, decimals)
+        for key, _, factor, decimals in SHOWN
+    )
+
+
+def provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
+    """What a reader needs to make a result again."""
+    return {
+        "version": __version__,
+        "scenarios": len(suite.scenarios),
+        "suite_hash": suite.hash,
+        "config_hash": loaded.hash,
+        "calibration_hash": loaded.calibration_hash,
+        "camera": camera_json(suite),
+        "seed": seed,
+    }
+
+
+def one_scenario(suite: Suite, name: str) -> Suite:
+    """The suite with only the scenario of this name (upper and lower case are alike)."""
+    found = [s for s in suite.scenarios if s.name.casefold() == name.strip().casefold()]
+    if not found:
+        near = difflib.get_close_matches(name, suite.names, 1)
+        mend = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(suite.names)}"
+        raise ScenarioError(f"--scenario {name!r}: there is no such scenario; {mend}")
+    return replace(suite, scenarios=tuple(found))
+
+
+def run_table(suite: Suite, decision: DecisionConfig) -> Result:
+    """Every scenario under one configuration, and the totals."""
+    states = suite.states(decision)
+    metrics = measure(suite.truth_frames, states)
+    rows: list[dict[str, Any]] = []
+    for index, (scenario, truth) in enumerate(zip(suite.scenarios, suite.truths, strict=True)):
+        frames = states[suite.run.lane_slice(index)]
+        share = np.bincount(frames, minlength=len(State)) / len(frames)
+        rows.append(
+            {
+                "scenario": scenario.name,
+                "hazard": scenario.hazard,
+                "expected": scenario.expected,
+                "dominant": State(int(share.argmax())).name.lower(),
+                "states": {s.name.lower(): float(share[s]) for s in State},
+                "frames": len(frames),
+                "danger_frames": int(truth.danger.sum()),
+                "actionable_frames": int(truth.actionable.sum()),
+                **metrics.scenario_dict(index),
+            }
+        )
+    totals = metrics.as_dict()
+    budgets = warning_budgets(suite, decision)
+    table = Table(
+        "run",
+        "Scenarios",
+        (
+            "scenario",
+            "hazard",
+            "expected",
+            "dominant",
+            "danger",
+            "actionable",
+            "sensitivity, %",
+            "specificity, %",
+            "SevFN, %",
+            "fatigue, %",
+            "latency, s",
+            "mean budget, s",
+            "min budget, s",
+            "lead, s",
+        ),
+        [
+            (
+                row["scenario"],
+                row["hazard"],
+                row["expected"],
+                row["dominant"],
+                row["danger_frames"],
+                row["actionable_frames"],
+                percent(row["sensitivity"]),
+                percent(row["specificity"]),
+                percent(row["sev_fn"]),
+                percent(row["fatigue"]),
+                seconds(row["alert_latency_s"]),
+                seconds(row["mean_warning_budget_s"]),
+                seconds(row["min_warning_budget_s"]),
+                seconds(row["first_onset_lead_s"]),
+            )
+            for row in rows
+        ],
+        "latency: from the first actionable frame to ALERT; lead: from the first ALERT to the "
+        "closest approach",
+    )
+    total = Table("run_totals", "All scenarios", SHOWN_COLUMNS, [shown(totals)])
+    return Result(
+        "run",
+        {
+            "decision": msgspec.to_builtins(decision),
+            "metrics": totals,
+            "scenarios": rows,
+            "budgets": budgets.data,
+        },
+        (table, total),
+    )
+
+
+def seconds(value: float | None) -> float | None:
+    """A time for a table: two decimals."""
+    return None if value is None else round(value, 2)
+
+
+def compare_table(
+    suite: Suite,
+    loaded: LoadedConfig,
+    configurations: Mapping[str, DecisionConfig] = CONFIGURATIONS,
+    seed: int = 0,
+) -> Result:
+    """All configurations, with and without localisation error."""
+    data = compare_json(suite, compare(suite, configurations), loaded, seed)
+    tables = tuple(
+        Table(
+            name,
+            title,
+            ("configuration", *SHOWN_COLUMNS),
+            [(c, *shown(metrics)) for c, metrics in data[key].items()],
+        )
+        for name, title, key in (
+            ("compare", "Configurations, with localisation error", "configurations"),
+            (
+                "compare_without_error",
+                "Configurations, without localisation error",
+                "without_localisation_error",
+            ),
+        )
+    )
+    return Result("compare", data, tables)
+
+
+def errors(suite: Suite) -> Result:
+    """Localisation error: the paper's table, and a map of the ground in front of the camera.
+
+    The map's rows go with `x_m` (forward), its columns with `y_m` (right); objects lie with their
+    length across the camera's axis. Null where no corner can be seen.
+    """
+    table = error_table(suite.camera)
+    x = np.arange(MAP_STEP_M, MAP_REACH_M + MAP_STEP_M / 2, MAP_STEP_M)
+    y = np.arange(-MAP_REACH_M, MAP_REACH_M + MAP_STEP_M / 2, MAP_STEP_M)
+    ground = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    across = np.tile([[0.0, 1.0]], (len(ground), 1))
+    maps: dict[str, Any] = {}
+    for kind in ("pedestrian", "cyclist", "car"):
+        put, area = localise(suite.camera, ground, across, SIZES_M[kind])
+        error = np.where(area > 0, np.hypot(*(put - ground).T), np.nan)
+        maps[kind] = {
+            "x_m": x.tolist(),
+            "y_m": y.tolist(),
+            "error_m": [[number(v) for v in row] for row in error.reshape(len(x), len(y))],
+        }
+    distances = list(dict.fromkeys(float(row["distance_m"]) for row in table))
+    cells = {(r["kind"], r["bearing_deg"], r["distance_m"]): float(r["error_m"]) for r in table}
+    lines = list(dict.fromkeys((str(r["kind"]), r["bearing_deg"]) for r in table))
+    return Result(
+        "errors",
+        {"table": table, "map": maps},
+        (
+            Table(
+                "errors",
+                "Localisation error, m",
+                ("kind", "bearing, degrees", *(f"{d:g} m" for d in distances)),
+                [
+                    (kind, bearing, *(round(cells[kind, bearing, d], 2) for d in distances))
+                    for kind, bearing in lines
+                ],
+            ),
+        ),
+    )
+
+
+def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> Result:
+    """The same decisions under other thresholds of the ground truth, one varied at a time."""
+    base = TruthSettings(braking=suite.truth_settings.braking)
+    states = suite.states(decision)
+    cases: list[tuple[str, float | None, TruthSettings]] = [
+        *(("cpa_radius_m", v, replace(base, cpa_radius_m=v)) for v in CPA_RADII_M),
+        *(("stopping_margin", v, replace(base, stopping_margin=v)) for v in STOPPING_MARGINS),
+        *(("ttc_bound_s", v, replace(base, ttc_bound_s=v)) for v in TTC_BOUNDS_S),
+        ("ttc_bound_s", None, base),
+    ]
+    rows = [
+        {
+            "parameter": parameter,
+            "value": value,
+            "default": settings == base,
+            **measure(suite.with_truth(settings).truth_frames, states).as_dict(),
+        }
+        for parameter, value, settings in cases
+    ]
+    names = {
+        "cpa_radius_m": "CPA radius, m",
+        "stopping_margin": "stopping margin",
+        "ttc_bound_s": "TTC bound, s",
+    }
+    table = Table(
+        "truth",
+        "Thresholds of the ground truth",
+        ("parameter", "value", "default", *SHOWN_COLUMNS),
+        [
+            (
+                names[row["parameter"]],
+                "1.87 + clearance" if row["value"] is None else row["value"],
+                "yes" if row["default"] else "",
+                *shown(row),
+            )
+            for row in rows
+        ],
+    )
+    return Result("truth", {"rows": rows}, (table,))
+
+
+def braking_profiles(suite: Suite, decision: DecisionConfig) -> Result:
+    """The same decisions when every cyclist brakes as one profile says, in truth only."""
+    states = suite.states(decision)
+    profiles = {"scenario": None, "bicycle": "bicycle", "ebike": "ebike", "aashto": "aashto"}
+    rows: list[dict[str, Any]] = []
+    for name, braking in profiles.items():
+        other = suite.with_truth(replace(suite.truth_settings, braking=braking))
+        rows.append({"profile": name, "metrics": measure(other.truth_frames, states).as_dict()})
+    table = Table(
+        "braking",
+        "Braking profiles of the ground truth",
+        ("profile", *SHOWN_COLUMNS),
+        [(row["profile"], *shown(row["metrics"])) for row in rows],
+        "scenario: bicycle or e-bike, as each scenario says",
+    )
+    return Result("braking", {"rows": rows}, (table,))
+
+
+def warning_budgets(suite: Suite, decision: DecisionConfig) -> Result:
+    """Time from each onset of ALERT to the closest approach, where there are actionable frames.
+
+    The class goes by the worst onset of a scenario; a scenario without any is "below".
+    """
+    states = suite.states(decision)
+    metrics: Metrics = measure(suite.truth_frames, states)
+    rows: list[dict[str, Any]] = []
+    for index, (scenario, truth) in enumerate(zip(suite.scenarios, suite.truths, strict=True)):
+        if not truth.actionable.any():
+            continue
+        alert = states[suite.run.lane_slice(index)] == State.ALERT
+        onset = onsets(alert) & np.isfinite(truth.budget_s)
+        worst = number(metrics.scenario_min_budget_s[index])
+        rows.append(
+            {
+                "scenario": scenario.name,
+                "mean": number(metrics.scenario_mean_budget_s[index]),
+                "min": worst,
+                "onsets": [float(v) for v in truth.budget_s[onset]],
+                "class": budget_class(worst),
+            }
+        )
+    table = Table(
+        "budgets",
+        "Warning budgets",
+        ("scenario", "mean, s", "min, s", "onsets", "class"),
+        [
+            (r["scenario"], seconds(r["mean"]), seconds(r["min"]), len(r["onsets"]), r["class"])
+            for r in rows
+        ],
+        f"distracted {PEDESTRIAN_PRT_S} s, attentive {ATTENTIVE_PRT_S} s; by the worst onset",
+    )
+    return Result("budgets", {"rows": rows}, (table,))
+
+
+def onsets(alert: BoolArray) -> BoolArray:
+    """Frames [f] of one scenario in which ALERT begins."""
+    return np.asarray(alert & ~np.concatenate([[False], alert[:-1]]))
+
+
+def budget_class(budget_s: float | None) -> str:
+    """A budget against the pedestrian's two reaction times."""
+    if budget_s is None or budget_s <= ATTENTIVE_PRT_S:
+        return "below"
+    return "above distracted" if budget_s > PEDESTRIAN_PRT_S else "above attentive"

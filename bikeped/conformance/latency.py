@@ -1,0 +1,138 @@
+"""Camera latency: detections come late, the world goes on (paper, section 4.7).
+
+The state of a frame is compared with the truth of that frame, whenever the picture was taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bikeped.config import DecisionConfig
+from bikeped.conformance.experiments import Progress, percent, quiet, seconds
+from bikeped.conformance.metrics import TruthFrames
+from bikeped.conformance.montecarlo import (
+    TRIALS,
+    Plan,
+    by_name,
+    measure_lanes,
+    run_plans,
+    summaries,
+)
+from bikeped.conformance.perception import RecallModel
+from bikeped.conformance.simulate import FPS, track
+from bikeped.conformance.suite import Suite
+from bikeped.conformance.tables import Result, Table
+
+#: 0 to 500 ms in steps of one frame.
+DELAYS_MS = tuple(range(0, 500, 33))
+#: The coarser steps at which latency is combined with loss.
+LOSS_DELAYS_MS = (0, 66, 132, 198, 330, 495)
+PREDICTORS = {"none": 0, "first": 1, "second": 2}
+#: The figures of the sweep's lists, over `delay_ms`.
+FIGURES = (
+    "sensitivity",
+    "specificity",
+    "sev_fn",
+    "fatigue",
+    "mean_warning_budget_s",
+    "contact_sensitivity",
+    "mean_alert_latency_s",
+    "adequate_share",
+)
+
+
+def delay_frames(delay_ms: float) -> int:
+    """Whole frames of a latency (definitions, section 7)."""
+    return round(delay_ms * FPS / 1000)
+
+
+def sweep(suite: Suite, decision: DecisionConfig, delays_ms: Sequence[float] = DELAYS_MS) -> Result:
+    """Every latency with every predictor, without loss: all of them lanes of one tracker."""
+    scenes = [s for ms in delays_ms for s in suite.scenes(delay_frames=delay_frames(ms))]
+    tracked = track(scenes)
+    truth: TruthFrames = suite.truth_frames
+    data: dict[str, Any] = {"delay_ms": list(delays_ms)}
+    for name, order in PREDICTORS.items():
+        found = measure_lanes(tracked, order, truth, {"": decision})[""]
+        rows = [metrics.as_dict() for metrics in found]
+        data[name] = {figure: [row[figure] for row in rows] for figure in FIGURES}
+    return Result("latency", data, (_table(data, "latency", "Camera latency"),))
+
+
+def _table(data: Mapping[str, Any], name: str, title: str) -> Table:
+    return Table(
+        name,
+        title,
+        (
+            "predictor",
+            "delay, ms",
+            "sensitivity, %",
+            "specificity, %",
+            "SevFN, %",
+            "fatigue, %",
+            "mean budget, s",
+            "contact sensitivity, %",
+        ),
+        [
+            (
+                predictor,
+                ms,
+                percent(lists["sensitivity"][i]),
+                percent(lists["specificity"][i]),
+                percent(lists["sev_fn"][i]),
+                percent(lists["fatigue"][i]),
+                seconds(lists["mean_warning_budget_s"][i]),
+                percent(lists["contact_sensitivity"][i]),
+            )
+            for predictor in PREDICTORS
+            for lists in (data[predictor],)
+            for i, ms in enumerate(data["delay_ms"])
+        ],
+        "predictor: how far tracks are carried over the latency (none, velocity, acceleration)",
+    )
+
+
+def sweep_with_loss(
+    suite: Suite,
+    decision: DecisionConfig,
+    delays_ms: Sequence[float] = LOSS_DELAYS_MS,
+    recall: RecallModel | None = None,
+    burst: float | None = None,
+    trials: int = TRIALS,
+    seed: int = 0,
+    processes: int = 1,
+    progress: Progress = quiet,
+) -> Result:
+    """Latency and lost detections together; size-aware recall, independent losses by default."""
+    model = recall or RecallModel("size")
+    plans = [Plan(model, burst, delay_frames(ms), tuple(PREDICTORS.values())) for ms in delays_ms]
+    found = run_plans(by_name(suite), plans, {"": decision}, trials, seed, processes, progress)
+    predictors: dict[str, Any] = {}
+    for name, order in PREDICTORS.items():
+        by_delay = [summaries(part[order][""]) for part in found]
+        predictors[name] = {
+            figure: {
+                key: [row[figure][key] for row in by_delay]
+                for key in ("mean", "low", "high", "sd", "p2_5", "p97_5")
+            }
+            for figure in FIGURES
+        }
+    data = {
+        "delay_ms": list(delays_ms),
+        "trials": trials,
+        "seed": seed,
+        "recall": model.mode,
+        "loss": "independent" if burst is None else "burst",
+        "burst": burst,
+        "predictors": predictors,
+    }
+    means = {
+        "delay_ms": data["delay_ms"],
+        **{
+            name: {figure: values["mean"] for figure, values in figures.items()}
+            for name, figures in predictors.items()
+        },
+    }
+    table = _table(means, "latency_loss", f"Camera latency with loss, mean of {trials} trials")
+    return Result("latency_loss", data, (table,))

@@ -1,0 +1,427 @@
+"""Monte Carlo: the suite with lost detections, many trials side by side in one tracker.
+
+Every trial of every scenario draws from its own generator, seeded by seed, scenario name and trial
+number (`perception.trial_generator`): results depend neither on the order of the scenarios nor on
+how the trials are spread over processes, and all ways of losing detections share their draws.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import multiprocessing
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bikeped.config import DecisionConfig, rule_settings
+from bikeped.conformance.experiments import Progress, percent, quiet
+from bikeped.conformance.metrics import Metrics, TruthFrames, measure
+from bikeped.conformance.perception import RecallMode, RecallModel, Seen, lost, trial_generator
+from bikeped.conformance.simulate import Scene, Tracked, rows_of, states, track
+from bikeped.conformance.suite import CONFIGURATIONS, Suite
+from bikeped.conformance.tables import Result, Table
+from bikeped.errors import BikepedError
+from bikeped.types import BoolArray, FloatArray, KindArray
+
+TRIALS = 50
+BURST_FRAMES = 5.0
+#: Bytes that the tracker's history of one chunk of lanes may take; some three times as much is in
+#: use while it is stacked and turned into rows.
+CHUNK_BYTES = 150_000_000
+#: Reported, id, kind, and three vectors, of one slot in one frame.
+_SLOT_BYTES = 1 + 8 + 1 + 3 * 16
+#: Environment that keeps each worker process on one core.
+_ONE_THREAD = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+
+#: Figures by trial: configuration's name to the metrics of each trial.
+TrialMetrics = dict[str, list[Metrics]]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What could be detected in one scenario: arrays over frames and agents [f, a].
+
+    `xy_m` [f, a, 2] in the camera ground frame; `kind` [a]; `name` seeds the draws.
+    """
+
+    name: str
+    xy_m: FloatArray
+    recall: FloatArray
+    present: BoolArray
+    kind: KindArray
+
+    @staticmethod
+    def of(name: str, seen: Seen, recall: RecallModel) -> Observed:
+        rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
+        return Observed(name, seen.observed_m, rate, seen.present, seen.kind)
+
+    def trials(
+        self, trials: Sequence[int], seed: int, burst: float | None, delay_frames: int = 0
+    ) -> list[Scene]:
+        """The detections of each trial."""
+        draw = np.stack(
+            [trial_generator(seed, self.name, t).random(self.recall.shape) for t in trials], axis=1
+        )
+        missed = lost(draw, self.recall[:, None], self.present[:, None], burst)
+        return [
+            Scene(self.xy_m, self.present & ~missed[:, i], self.kind, delay_frames)
+            for i in range(len(trials))
+        ]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One way of losing detections; `orders` are the predictors that are asked (0: none)."""
+
+    recall: RecallModel
+    burst: float | None
+    delay_frames: int = 0
+    orders: tuple[int, ...] = (0,)
+
+
+def simulate_trials(
+    observed: Sequence[Observed],
+    truth: TruthFrames,
+    plan: Plan,
+    configurations: Mapping[str, DecisionConfig],
+    trials: Sequence[int],
+    seed: int,
+) -> dict[int, TrialMetrics]:
+    """Metrics of every trial by predictor order and configuration; `truth` joins the scenarios of
+    `observed` in their order."""
+    return simulate_views([observed], truth, plan, configurations, trials, seed)[0]
+
+
+def simulate_views(
+    views: Sequence[Sequence[Observed]],
+    truth: TruthFrames,
+    plan: Plan,
+    configurations: Mapping[str, DecisionConfig],
+    trials: Sequence[int],
+    seed: int,
+) -> list[dict[int, TrialMetrics]]:
+    """The same of several views of the same scenarios (other cameras), in the same trackers."""
+    every = [o for view in views for o in view]
+    frames = max(len(o.xy_m) for o in every)
+    slots = max(2 * max(o.xy_m.shape[1] for o in every), 4)
+    size = max(1, CHUNK_BYTES // (truth.count * frames * slots * _SLOT_BYTES))
+    units = [(view, trial) for view in range(len(views)) for trial in trials]
+    found: list[dict[int, TrialMetrics]] = [
+        {order: {name: [] for name in configurations} for order in plan.orders} for _ in views
+    ]
+    for begin in range(0, len(units), size):
+        part = units[begin : begin + size]
+        scenes: list[Scene] = []
+        for view in dict.fromkeys(v for v, _ in part):
+            mine = [trial for v, trial in part if v == view]
+            by_scenario = [o.trials(mine, seed, plan.burst, plan.delay_frames) for o in views[view]]
+            # Trial after trial, and in each the scenarios in their order: as `truth` has them.
+            scenes += [lanes[i] for i in range(len(mine)) for lanes in by_scenario]
+        tracked = track(scenes)
+        for order in plan.orders:
+            for name, metrics in measure_lanes(tracked, order, truth, configurations).items():
+                for (view, _), one in zip(part, metrics, strict=True):
+                    found[view][order][name].append(one)
+    return found
+
+
+def measure_lanes(
+    tracked: Tracked, order: int, truth: TruthFrames, configurations: Mapping[str, DecisionConfig]
+) -> TrialMetrics:
+    """Metrics of every repetition of the suite among the lanes, by configuration."""
+    run = rows_of(tracked, order)
+    repeats = tracked.lanes // truth.count
+    return {
+        name: [
+            measure(truth, part)
+            for part in states(run, rule_settings(decision)).reshape(repeats, -1)
+        ]
+        for name, decision in configurations.items()
+    }
+
+
+def by_name(suite: Suite) -> Suite:
+    """The suite in order of names: sums of floats depend on their order, results must not."""
+    return replace(suite, scenarios=tuple(sorted(suite.scenarios, key=lambda s: s.name)))
+
+
+@contextlib.contextmanager
+def pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Worker processes on one core each, started afresh: a fork would copy our threads' locks."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    try:
+        yield executor
+    finally:
+        # After an interruption what waits is dropped, what runs is waited for.
+        executor.shutdown(cancel_futures=True)
+        for name, value in before.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+
+
+def plan_trials(
+    suite: Suite,
+    plan: Plan,
+    configurations: Mapping[str, DecisionConfig],
+    trials: Sequence[int],
+    seed: int,
+) -> dict[int, TrialMetrics]:
+    """`simulate_trials` of a suite (in order of names), one job of a process."""
+    observed = [
+        Observed.of(s.name, seen, plan.recall)
+        for s, seen in zip(suite.scenarios, suite.seen, strict=True)
+    ]
+    return simulate_trials(observed, suite.truth_frames, plan, configurations, trials, seed)
+
+
+def run_plans(
+    suite: Suite,
+    plans: Sequence[Plan],
+    configurations: Mapping[str, DecisionConfig],
+    trials: int,
+    seed: int,
+    processes: int = 1,
+    progress: Progress = quiet,
+) -> list[dict[int, TrialMetrics]]:
+    """All plans over all trials; `suite` in order of names. Progress counts `plan_jobs`."""
+    parts = [range(trials)[i::processes] for i in range(min(processes, trials))]
+    jobs = [(i, part) for i in range(len(plans)) for part in parts]
+    done: dict[tuple[int, int], dict[int, TrialMetrics]] = {}
+    with contextlib.ExitStack() as stack:
+        executor: Executor | None = None
+        if processes > 1 and len(jobs) > 1:
+            executor = stack.enter_context(pool(processes))
+            waiting = {
+                executor.submit(plan_trials, suite, plans[i], configurations, part, seed): (i, part)
+                for i, part in jobs
+            }
+            for count, future in enumerate(as_completed(waiting)):
+                i, part = waiting[future]
+                done[i, part.start] = future.result()
+                progress(count + 1)
+        else:
+            for count, (i, part) in enumerate(jobs):
+                done[i, part.start] = plan_trials(suite, plans[i], configurations, part, seed)
+                progress(count + 1)
+    merged = []
+    for i, plan in enumerate(plans):
+        whole: dict[int, TrialMetrics] = {}
+        for order in plan.orders:
+            whole[order] = {}
+            for name in configurations:
+                row: list[Metrics | None] = [None] * trials
+                for part in parts:
+                    row[part.start :: len(parts)] = done[i, part.start][order][name]
+                whole[order][name] = [m for m in row if m is not None]
+        merged.append(whole)
+    return merged
+
+
+def plan_jobs(plans: int, trials: int, processes: int) -> int:
+    """How far the progress of `run_plans` counts."""
+    return plans * min(processes, trials)
+
+
+def summary(values: Iterable[float]) -> dict[str, float | int | None]:
+    """Mean over trials with its 95 % confidence interval (Student), and the trials' own spread.
+
+    Trials without the figure (NaN) are left out; null without any, no interval from one alone.
+    """
+    known = np.asarray([v for v in values if np.isfinite(v)], np.float64)
+    count = len(known)
+    if count == 0:
+        empty = dict.fromkeys(("mean", "low", "high", "sd", "p2_5", "p97_5"))
+        return {**empty, "trials": 0}
+    mean, low_share, high_share = known.mean(), *np.percentile(known, [2.5, 97.5])
+    sd = float(known.std(ddof=1)) if count > 1 else None
+    half = None if sd is None else _student(count - 1) * sd / float(np.sqrt(count))
+    return {
+        "mean": float(mean),
+        "low": None if half is None else float(mean - half),
+        "high": None if half is None else float(mean + half),
+        "sd": sd,
+        "p2_5": float(low_share),
+        "p97_5": float(high_share),
+        "trials": count,
+    }
+
+
+def _student(freedom: int) -> float:
+    """97.5 % quantile of Student's t."""
+    try:
+        from scipy.special import stdtrit
+    except ImportError as error:  # pragma: no cover - the sim extra is not there
+        raise BikepedError("scipy: not installed; install bikeped[sim]") from error
+    return float(stdtrit(freedom, 0.975))
+
+
+def summaries(metrics: Sequence[Metrics]) -> dict[str, Any]:
+    """`summary` of every figure of a metrics dictionary over trials."""
+    rows = [m.as_dict() for m in metrics]
+    return {key: summary(_real(row[key]) for row in rows) for key in rows[0]}
+
+
+def scenario_summaries(metrics: Sequence[Metrics], index: int) -> dict[str, Any]:
+    """The same of one scenario's figures."""
+    rows = [m.scenario_dict(index) for m in metrics]
+    return {key: summary(_real(row[key]) for row in rows) for key in rows[0]}
+
+
+def _real(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def montecarlo(
+    suite: Suite,
+    configurations: Mapping[str, DecisionConfig] = CONFIGURATIONS,
+    trials: int = TRIALS,
+    seed: int = 0,
+    burst: float = BURST_FRAMES,
+    curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None,
+    processes: int = 1,
+    progress: Progress = quiet,
+) -> Result:
+    """Independent and bursty losses, recall flat, by size and (when given) by curve.
+
+    `by_scenario` tells the first configuration, independent losses, the finest recall given.
+    """
+    ordered = by_name(suite)
+    models = recall_models(curve)
+    cases = [(loss, model) for loss in ("independent", "burst") for model in models]
+    plans = [Plan(model, burst if loss == "burst" else None) for loss, model in cases]
+    found = run_plans(ordered, plans, configurations, trials, seed, processes, progress)
+    rows: list[dict[str, Any]] = []
+    for (loss, model), part in zip(cases, found, strict=True):
+        for name, metrics in part[0].items():
+            case = {"loss": loss, "recall": model.mode, "configuration": name}
+            rows.append({**case, "metrics": summaries(metrics)})
+    detailed = len(models) - 1
+    first = next(iter(configurations))
+    by_scenario = {
+        name: scenario_summaries(found[detailed][0][first], ordered.names.index(name))
+        for name in suite.names
+    }
+    data = {
+        "trials": trials,
+        "seed": seed,
+        "burst": burst,
+        "rows": rows,
+        "by_scenario": by_scenario,
+        "by_scenario_of": {
+            "loss": "independent",
+            "recall": models[detailed].mode,
+            "configuration": first,
+        },
+    }
+    if curve is not None:
+        data["curve"] = {"area_px2": list(curve[0]), "recall": list(curve[1])}
+    return Result("montecarlo", data, tuple(_tables(data, burst, trials)))
+
+
+def montecarlo_jobs(trials: int, processes: int, curve: bool) -> int:
+    """How far the progress of `montecarlo` counts."""
+    return plan_jobs(6 if curve else 4, trials, processes)
+
+
+def _tables(data: Mapping[str, Any], burst: float, trials: int) -> Iterator[Table]:
+    columns = ("sensitivity, %", "from, %", "to, %", "specificity, %", "SevFN, %", "fatigue, %")
+    ends = ("mean budget, s", "contact sensitivity, %")
+    note = (
+        f"{trials} trials; from and to: 95 % confidence interval of the mean; bursts of {burst:g} "
+        "frames on average"
+    )
+
+    def cells(metrics: Mapping[str, Any]) -> tuple[float | None, ...]:
+        means = {key: value["mean"] for key, value in metrics.items()}
+        budget = means["mean_warning_budget_s"]
+        return (
+            percent(means["sensitivity"]),
+            percent(metrics["sensitivity"]["low"]),
+            percent(metrics["sensitivity"]["high"]),
+            percent(means["specificity"]),
+            percent(means["sev_fn"]),
+            percent(means["fatigue"]),
+            None if budget is None else round(budget, 2),
+            percent(means.get("contact_sensitivity")),
+        )
+
+    yield Table(
+        "montecarlo",
+        "Monte Carlo",
+        ("loss", "recall", "configuration", *columns, *ends),
+        [(r["loss"], r["recall"], r["configuration"], *cells(r["metrics"])) for r in data["rows"]],
+        note,
+    )
+    case = data["by_scenario_of"]
+    yield Table(
+        "montecarlo_by_scenario",
+        f"Monte Carlo by scenario: {case['configuration']}, {case['loss']}, {case['recall']}",
+        ("scenario", *columns, ends[0]),
+        [(name, *cells(metrics)[:-1]) for name, metrics in data["by_scenario"].items()],
+        note,
+    )
+
+
+def recall_models(
+    curve: tuple[tuple[float, ...], tuple[float, ...]] | None,
+) -> list[RecallModel]:
+    """From the coarsest to the finest."""
+    modes: list[RecallMode] = ["flat", "size"]
+    models = [RecallModel(mode) for mode in modes]
+    return models if curve is None else [*models, RecallModel("curve", curve)]
+
+
+def load_recall_curve(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Bin centres (square pixels at the network's input) and the recall of each bin.
+
+    CSV with the two columns (a header is allowed), or JSON: a list of [centre, recall], or
+    `{"area_px2": [...], "recall": [...]}`. BikepedError names the file and the mend.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BikepedError(f"{path}: cannot be read; check --recall-curve") from error
+    try:
+        pairs = _json_pairs(text) if path.suffix == ".json" else _csv_pairs(text)
+        values = np.asarray(pairs, np.float64).reshape(-1, 2)
+    except (ValueError, TypeError, KeyError, RecursionError, csv.Error) as error:
+        raise BikepedError(
+            f"{path}: is not a recall curve; write lines of bin centre, recall"
+        ) from error
+    centre, recall = values[:, 0], values[:, 1]
+    if len(values) < 2 or not np.isfinite(values).all() or not (np.diff(centre) > 0).all():
+        raise BikepedError(f"{path}: bin centre: needs two or more finite centres that increase")
+    if centre[0] < 0 or recall.min() < 0 or recall.max() > 1:
+        raise BikepedError(f"{path}: recall: expected 0 to 1 at centres from 0; correct the values")
+    return tuple(centre.tolist()), tuple(recall.tolist())
+
+
+def _json_pairs(text: str) -> list[Any]:
+    data = json.loads(text)
+    if isinstance(data, dict):
+        return list(zip(data["area_px2"], data["recall"], strict=True))
+    return list(data)
+
+
+def _csv_pairs(text: str) -> list[list[float]]:
+    lines = [line for line in csv.reader(io.StringIO(text)) if line]
+    if lines:
+        try:
+            float(lines[0][0])
+        except ValueError:
+            lines = lines[1:]  # a header
+    return [[float(a), float(b)] for a, b in lines]
