@@ -49,6 +49,18 @@ def json_option(command: F) -> F:
     )(command)
 
 
+def check_json_target(target: str | None) -> None:
+    """Raises BikepedError now rather than after minutes of work when `--json` cannot be written."""
+    if target is None or target == "-":
+        return
+    folder = Path(target).parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK) or Path(target).is_dir():
+        raise BikepedError(
+            f"--json {target}: cannot be written; name a file in a folder that exists and that you "
+            "may write"
+        )
+
+
 def write_json(data: Any, target: str) -> None:
     """Writes JSON to a file (whole or not at all) or to standard output."""
     text = json.dumps(data, indent=2, allow_nan=False) + "\n"

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import click
 
-from bikeped.cli.common import config_options, json_option, progress_bar, write_json, write_whole
+from bikeped.cli.common import (
+    check_json_target,
+    config_options,
+    json_option,
+    progress_bar,
+    write_json,
+    write_whole,
+)
 from bikeped.cli.replay import make_folder
 from bikeped.config import framing, ground_camera, load_config
 
@@ -21,9 +28,18 @@ from bikeped.config import framing, ground_camera, load_config
     show_default=True,
     help="Folder for the clip, the overlay video, the events and the summary.",
 )
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=0.1),
+    help="Only the beginning: so many seconds of the crossing.",
+)
 @json_option
 def command(
-    config_path: Path | None, overrides: tuple[str, ...], out: Path, json_path: str | None
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    out: Path,
+    seconds: float | None,
+    json_path: str | None,
 ) -> None:
     """Draw a scripted crossing as fisheye video and run it through the whole loop."""
     from bikeped.conformance.scenario import load_scenario
@@ -38,17 +54,20 @@ def command(
     from bikeped.service.drawn import DrawnEye
     from bikeped.service.replay import ReplayFiles, replay
 
+    check_json_target(json_path)
     loaded = load_config(config_path, overrides)
     make_folder(out)
     scenario = load_scenario(bundled_scenario())
     clip, events, overlay = out / "crossing.avi", out / "events.jsonl", out / "overlay.mp4"
-    frames = len(scenario.frame_times())
+    times = scenario.frame_times()
+    frames = len(times) if seconds is None else int((times < seconds).sum())
     with progress_bar("drawing", frames) as tell:
         write_clip(
             scenario,
             clip,
             ground_camera(loaded),
             framing(loaded),
+            seconds=seconds,
             progress=lambda done, _: tell(done),
         )
     with progress_bar("replaying", frames) as tell:

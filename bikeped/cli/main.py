@@ -56,7 +56,11 @@ def main(arguments: list[str] | None = None) -> int:
         click.echo("bikeped: interrupted", err=True)
         return 130
     except click.ClickException as error:
-        command = getattr(getattr(error, "ctx", None), "command_path", None) or "bikeped"
+        context: click.Context | None = getattr(error, "ctx", None)
+        if context is not None and type(error).__name__ == "NoArgsIsHelpError":  # click 8.2 on
+            click.echo(context.get_help(), err=True)
+            return 2
+        command = context.command_path if context is not None else "bikeped"
         click.echo(
             f"bikeped: {' '.join(error.format_message().split())}; see {command} --help", err=True
         )
@@ -66,8 +70,6 @@ def main(arguments: list[str] | None = None) -> int:
     except BikepedError as error:
         click.echo(f"bikeped: {' '.join(str(error).split())}", err=True)
         return error.exit_status
-    except BrokenPipeError:
-        return 0
     return int(result or 0)
 
 

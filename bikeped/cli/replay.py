@@ -9,7 +9,14 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
+from bikeped.cli.common import (
+    check_json_target,
+    config_options,
+    console,
+    json_option,
+    progress_bar,
+    write_json,
+)
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
 
@@ -44,6 +51,7 @@ def command(
     """Run VIDEO (a file or a folder of pictures) through the loop and say what it decided."""
     from bikeped.service.replay import ReplayFiles, replay
 
+    check_json_target(json_path)
     loaded = load_config(config_path, overrides)
     if out is not None:
         make_folder(out)

@@ -36,16 +36,20 @@ def write_clip(
     size: tuple[int, int] = (1920, 1080),
     fps: int = 30,
     quality: int = 85,
+    seconds: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Draws `scenario` into `path` (.avi, Motion JPEG) and its boxes beside it; returns their file.
 
-    The same arguments give the same bytes. `progress` is called with frames done and in all.
+    The same arguments give the same bytes. `seconds` ends the clip early. `progress` is called with
+    frames done and in all.
     """
     if path.suffix.lower() != ".avi":
         raise CaptureError(f"{path}: is not an .avi name; end the clip's name with .avi")
     scene = Scene(scenario, camera, framing, pose, size)
     times = scenario.frame_times(fps).tolist()
+    if seconds is not None:
+        times = [t for t in times if t < seconds]
     header = {
         "format": FORMAT,
         "scenario": scenario.name,

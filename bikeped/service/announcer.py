@@ -67,7 +67,8 @@ class Announcer:
         if self._speaker is not None:
             self._speaker.play(signal.sound)
         if self.shown is None or self.shown.name != signal.name:
-            log.info("%s: %s", signal.name, sentence)
+            known = sentence.startswith(f"{signal.name}:")
+            log.info("%s", sentence if known else f"{signal.name}: {sentence}")
         self.shown = signal
         for listener in self._listeners:
             self._tell_listener(listener, signal, sentence)

@@ -1,0 +1,79 @@
+"""`bikeped doctor`: what works, what does not, and what to do about it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.table import Table
+
+from bikeped.cli.common import check_json_target, config_options, console, json_option, write_json
+from bikeped.config import default_config_path, load_config
+from bikeped.errors import BikepedError
+
+if TYPE_CHECKING:
+    from bikeped.service.doctor import Finding
+
+_STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skipped": "dim"}
+
+
+@click.command("doctor")
+@config_options
+@click.option("--no-light", is_flag=True, help="Do not touch the lamps: they speak to the street.")
+@click.option("--no-sound", is_flag=True, help="Do not play the chime.")
+@json_option
+def command(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    no_light: bool,
+    no_sound: bool,
+    json_path: str | None,
+) -> int:
+    """Check camera, model, light, speaker, broker, clock and disk; 1 when one of them fails."""
+    from bikeped.service.doctor import Finding, checks, examine
+
+    check_json_target(json_path)
+    file = config_path or default_config_path()
+    findings: list[Finding] = []
+    try:
+        loaded = load_config(config_path, overrides)
+    except BikepedError as error:
+        if not file.is_file() or overrides:
+            raise  # the command line is wrong, not the pole
+        findings.append(Finding("configuration", "fail", str(error), "the rest waits for this"))
+    else:
+        todo = checks(light=not no_light, sound=not no_sound)
+        screen = console("-")  # what is going on, where no JSON goes
+        with screen.status("checking") as status:
+            for check, finding in zip(todo, examine(loaded, todo), strict=True):
+                findings.append(finding)
+                status.update(f"checking, {check.name} done")
+    failed = any(finding.status == "fail" for finding in findings)
+    report = {
+        "ok": not failed,
+        "source": str(file),
+        "checks": [dataclasses.asdict(finding) for finding in findings],
+    }
+    if json_path is not None:
+        write_json(report, json_path)
+    if json_path != "-":
+        _print(findings)
+    return int(failed)
+
+
+def _print(findings: list[Finding]) -> None:
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        text = finding.detail + (f"\n-> {finding.mend}" if finding.mend else "")
+        table.add_row(f"[{_STYLES[finding.status]}]{finding.status}[/]", finding.name, _plain(text))
+    console().print(table)
+
+
+def _plain(text: str) -> str:
+    """Text in which rich finds no markup."""
+    return text.replace("[", "\\[")
