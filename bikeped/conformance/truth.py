@@ -239,8 +239,10 @@ class _Best:
 
     def take(self, pair: _PairTruth, cyclist: int, pedestrian: int) -> None:
         none_yet = self.cyclist < 0
-        worse_danger = pair.danger & (~self.danger | (pair.severity > self.severity))
-        nearer = ~pair.danger & ~self.danger & (none_yet | (pair.d_min < self.d_min))
+        # Two cyclists of one speed tie, whatever the last bit of their differences says.
+        severer = pair.severity > self.severity + _EPSILON
+        worse_danger = pair.danger & (~self.danger | severer)
+        nearer = ~pair.danger & ~self.danger & (none_yet | (pair.d_min < self.d_min - _EPSILON))
         at = pair.considered & (worse_danger | nearer)
         self.danger[at] = pair.danger[at]
         self.severity[at] = pair.severity[at]
