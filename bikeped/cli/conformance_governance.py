@@ -413,15 +413,9 @@ def _changed_table(
         table.add_column(column, justify="left" if column == "Scenario" else "right")
     for name, entry in changed.items():
         sides = [s["by_scenario"][name] for s in (before, after) if name in s["by_scenario"]]
-        figures = [
-            " > ".join(_bare(value(side), unit) for side in sides)
-            for value, unit in (
-                (lambda side: side["states"]["ALERT"], "%"),
-                (lambda side: side["sensitivity"], "%"),
-                (lambda side: side["sev_fn"], "%"),
-                (lambda side: side["min_warning_budget_s"], "s"),
-            )
-        ]
+        figures = [" > ".join(_bare(s["states"]["ALERT"], "%") for s in sides)]
+        for key, unit in (("sensitivity", "%"), ("sev_fn", "%"), ("min_warning_budget_s", "s")):
+            figures.append(" > ".join(_bare(side[key], unit) for side in sides))
         if "frames_state" in entry:
             frames = [str(entry["frames_state"]), str(entry["frames_truth"])]
         else:

@@ -1,0 +1,148 @@
+"""Audit records of a simulated run: what was true, what was seen, what was decided, every frame.
+
+JSON Lines: for each scenario one `header`, then one `frame` after the other (paper, section 4:
+post-hoc review of any individual alert or missed detection). Positions are in the camera ground
+frame (x forward, y right, metres), times in seconds.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bikeped import __version__
+from bikeped.config import DecisionConfig, LoadedConfig, config_hash, rule_settings
+from bikeped.config.provenance import decision_hash
+from bikeped.conformance.simulate import Run, verdicts
+from bikeped.conformance.suite import Suite, camera_json
+from bikeped.errors import BikepedError
+from bikeped.types import FloatArray, State
+
+#: Decimals of a record: 0.1 mm, 0.1 ms.
+_DIGITS = 4
+
+
+def write_audit(
+    path: Path, suite: Suite, decision: DecisionConfig, loaded: LoadedConfig, seed: int = 0
+) -> None:
+    """Writes the audit of a run without loss; the file appears whole or not at all.
+
+    `seed` is recorded: what draws no random numbers gives the same file under every seed.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        with partial.open("w", encoding="utf-8") as file:
+            for record in audit_records(suite, decision, loaded, seed):
+                file.write(json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n")
+        partial.replace(path)
+    except OSError as error:
+        raise BikepedError(
+            f"{path}: the audit cannot be written ({error.strerror}); give --audit a file in a "
+            "folder that exists and has room"
+        ) from error
+
+
+def audit_records(
+    suite: Suite, decision: DecisionConfig, loaded: LoadedConfig, seed: int = 0
+) -> Iterator[dict[str, Any]]:
+    """The records of all scenarios in order, header first."""
+    run = suite.run
+    states = suite.states(decision)
+    fired = _first_fired(run, decision)
+    rows_of_frame = np.searchsorted(run.rows.frame, np.arange(len(run.time_s) + 1))
+    config = msgspec.structs.replace(loaded.config, decision=decision)
+    common = {
+        "version": __version__,
+        "config_hash": config_hash(config, loaded.calibration_hash),
+        "decision_hash": decision_hash(decision),
+        "calibration_hash": loaded.calibration_hash,
+        "suite_hash": suite.hash,
+        "seed": seed,
+        "camera": camera_json(suite),
+        "decision": msgspec.to_builtins(decision),
+    }
+    for lane, scenario in enumerate(suite.scenarios):
+        frames = run.lane_slice(lane)
+        yield {
+            "type": "header",
+            "scenario": scenario.name,
+            "hazard": scenario.hazard,
+            "expected": scenario.expected,
+            "vehicle": scenario.vehicle,
+            "frames": frames.stop - frames.start,
+            "agents": [{"id": a.id, "kind": a.kind} for a in scenario.agents],
+            **common,
+        }
+        truth, seen = suite.truths[lane], suite.seen[lane]
+        error = seen.error_m
+        for i, frame in enumerate(range(frames.start, frames.stop)):
+            known = truth.cyclist[i] >= 0
+            yield {
+                "type": "frame",
+                "scenario": scenario.name,
+                "frame": i,
+                "t": _real(truth.time_s[i]),
+                "agents": [
+                    {
+                        "id": agent.id,
+                        "true": _point(seen.true_m[i, a]),
+                        "observed": _point(seen.observed_m[i, a]),
+                        "error_m": _real(error[i, a]),
+                    }
+                    for a, agent in enumerate(scenario.agents)
+                    if seen.present[i, a]
+                ],
+                "tracks": [
+                    {
+                        "id": int(run.rows.id[row]),
+                        "kind": int(run.rows.kind[row]),
+                        "at": _point(run.rows.xy_m[row]),
+                    }
+                    for row in range(rows_of_frame[frame], rows_of_frame[frame + 1])
+                ],
+                "state": State(int(states[frame])).name,
+                "alert_tracks": fired.get(frame),
+                "pair": [int(truth.cyclist[i]), int(truth.pedestrian[i])] if known else None,
+                "distance_m": _real(truth.distance_m[i]),
+                "danger": bool(truth.danger[i]),
+                "actionable": bool(truth.actionable[i]),
+                "severity": _real(truth.severity[i]),
+                "ttc_s": _real(truth.ttc_s[i]),
+                "budget_s": _real(truth.budget_s[i]),
+            }
+
+
+def _first_fired(run: Run, decision: DecisionConfig) -> dict[int, dict[str, Any]]:
+    """By frame: the first pair in track order that fired, as the pole would name it, and why."""
+    found = verdicts(run, rule_settings(decision))
+    pairs, rows = run.pairs, run.rows
+    out: dict[int, dict[str, Any]] = {}
+    for index in np.nonzero(found.fires)[0]:
+        cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist[index]], pairs.pedestrian_row[index]
+        out.setdefault(
+            int(rows.frame[pedestrian]),
+            {
+                "cyclist": int(rows.id[cyclist]),
+                "pedestrian": int(rows.id[pedestrian]),
+                "distance_m": _real(found.distance_m[index]),
+                "distance_then_m": _real(found.distance_then_m[index]),
+                "lookback_s": _real(found.lookback_s[index]),
+                "displacement_m": _real(found.displacement_m[index]),
+                "d_max_m": _real(found.d_max_m[index]),
+            },
+        )
+    return out
+
+
+def _real(value: float) -> float | None:
+    return round(float(value), _DIGITS) if math.isfinite(value) else None
+
+
+def _point(xy: FloatArray) -> list[float | None]:
+    return [_real(xy[0]), _real(xy[1])]

@@ -1,0 +1,236 @@
+"""Contesting a decision: other scenarios, parameters or thresholds, before beside after.
+
+No camera, no model and no access to the pole is needed (paper, section 4: can the decision be
+contested?).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.config import DecisionConfig
+from bikeped.config.provenance import decision_hash
+from bikeped.conformance.gates import all_hold, check
+from bikeped.conformance.metrics import Metrics, number
+from bikeped.conformance.scenario import Scenario, dump_scenario
+from bikeped.conformance.suite import Suite
+from bikeped.conformance.truth import BRAKING, TruthSettings
+from bikeped.errors import BikepedError, ScenarioError
+from bikeped.types import BoolArray, State
+
+_TRUTH_RANGE = {"cpa_radius_m": 25.0, "stopping_margin": 10.0, "ttc_bound_s": 60.0}
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of the comparison: a suite, a decision, and what they give."""
+
+    suite: Suite
+    decision: DecisionConfig
+    states: npt.NDArray[np.int8]
+    metrics: Metrics
+
+    @staticmethod
+    def of(suite: Suite, decision: DecisionConfig) -> Side:
+        return Side(suite, decision, suite.states(decision), suite.measure(decision))
+
+    def part(self, name: str) -> slice:
+        """Where a scenario's frames lie."""
+        return self.suite.run.lane_slice(self.suite.names.index(name))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Totals, gates and figures by scenario, for JSON."""
+        return {
+            "suite_hash": self.suite.hash,
+            "scenarios": len(self.suite.scenarios),
+            "decision": msgspec.to_builtins(self.decision),
+            "decision_hash": decision_hash(self.decision),
+            "truth": truth_dict(self.suite.truth_settings),
+            "totals": self.metrics.as_dict(),
+            "gates": [gate.as_dict() for gate in check(self.metrics)],
+            "promotable": all_hold(check(self.metrics)),
+            "by_scenario": {
+                name: {"states": self._shares(name), **self.metrics.scenario_dict(i)}
+                for i, name in enumerate(self.suite.names)
+            },
+        }
+
+    def _shares(self, name: str) -> dict[str, float]:
+        states = self.states[self.part(name)]
+        return {s.name: float((states == int(s)).mean()) for s in State}
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Before and after, and what changed between them."""
+
+    before: Side
+    after: Side
+    changed: list[dict[str, Any]]
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "changed": self.changed,
+        }
+
+
+def contest(
+    before: Suite, decision: DecisionConfig, after: Suite, other: DecisionConfig
+) -> Contest:
+    """Runs both sides and lists every scenario that is new or in which anything changed."""
+    old, new = Side.of(before, decision), Side.of(after, other)
+    scripts = {s.name: dump_scenario(s) for s in before.scenarios}
+    changed = []
+    for index, scenario in enumerate(after.scenarios):
+        name = scenario.name
+        if name not in scripts:
+            what = "new scenario"
+        elif scripts[name] != dump_scenario(scenario):
+            what = "replaced scenario"
+        else:
+            entry = _differences(old, new, name, index)
+            if entry["frames_state"] or entry["frames_truth"]:
+                changed.append(entry)
+            continue
+        changed.append({"scenario": name, "what": what, "frames": len(after.truths[index].time_s)})
+    return Contest(old, new, changed)
+
+
+def with_scenarios(suite: Suite, added: Sequence[Scenario]) -> Suite:
+    """The suite with further scenarios; one of a name that is there already takes its place."""
+    names = [s.name for s in added]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise ScenarioError(f"--scenario: {twice!r} is given twice; give each its own name")
+    new = {s.name: s for s in added}
+    kept = [new.pop(s.name, s) for s in suite.scenarios]
+    return Suite((*kept, *new.values()), suite.camera, suite.pose, suite.truth_settings)
+
+
+def parse_truth(settings: TruthSettings, items: Sequence[str]) -> TruthSettings:
+    """`KEY=VALUE` items over ground-truth thresholds; BikepedError names the key and the mend."""
+    for item in items:
+        key, equals, text = (part.strip() for part in item.partition("="))
+        said = f"--truth {' '.join(item.split())}"
+        if not equals:
+            raise BikepedError(f"{said}: expected KEY=VALUE, e.g. --truth cpa_radius_m=7")
+        if key == "braking":
+            if text not in BRAKING:
+                raise BikepedError(f"{said}: unknown profile; use one of {', '.join(BRAKING)}")
+            settings = replace(settings, braking=text)
+        elif key in _TRUTH_RANGE:
+            value = _float(text, said)
+            if not 0 < value <= _TRUTH_RANGE[key]:
+                raise BikepedError(f"{said}: use a value above 0 to {_TRUTH_RANGE[key]:g}")
+            # The keys are checked above, the values are numbers.
+            settings = replace(settings, **{key: value})  # type: ignore[arg-type]
+        else:
+            known = ", ".join([*_TRUTH_RANGE, "braking"])
+            raise BikepedError(f"{said}: unknown threshold; known are {known}")
+    return settings
+
+
+def apply_bounds(decision: DecisionConfig, items: Sequence[str]) -> DecisionConfig:
+    """`KEY=LOW..HIGH` items: what the decision is when nobody may set a key outside the bound.
+
+    A value outside is moved to the nearest end (either end may be left open: `d_max_m=..15`).
+    """
+    for item in items:
+        said = f"--bound {' '.join(item.split())}"
+        match = re.fullmatch(r"\s*(?:decision\.)?(\w+)\s*=\s*(\S*?)\s*\.\.\s*(\S*?)\s*", item)
+        if match is None or not (match[2] or match[3]):
+            raise BikepedError(f"{said}: expected KEY=LOW..HIGH, e.g. --bound d_max_m=5..15")
+        key = match[1]
+        value = getattr(decision, key, None)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            numbers = [
+                k for k, v in msgspec.to_builtins(decision).items() if type(v) in (int, float)
+            ]
+            raise BikepedError(f"{said}: not a number of the decision; known: {', '.join(numbers)}")
+        low = _float(match[2], said) if match[2] else -np.inf
+        high = _float(match[3], said) if match[3] else np.inf
+        if low > high:
+            raise BikepedError(f"{said}: {low:g} is above {high:g}; exchange them")
+        moved = min(max(value, low), high)
+        if isinstance(value, int) and moved != value:
+            moved = int(np.ceil(moved) if moved == low else np.floor(moved))
+            if not low <= moved <= high:
+                raise BikepedError(f"{said}: holds no whole number; widen it")
+        data = {**msgspec.to_builtins(decision), key: moved}
+        try:
+            decision = msgspec.convert(data, DecisionConfig, strict=True)
+        except msgspec.ValidationError as error:
+            raise BikepedError(f"{said}: {error}; choose a bound that the key allows") from error
+    if decision.d_min_m > decision.d_max_m:
+        raise BikepedError(
+            f"--bound: d_min_m {decision.d_min_m:g} comes to lie above d_max_m "
+            f"{decision.d_max_m:g}; choose bounds that overlap"
+        )
+    return decision
+
+
+def truth_dict(settings: TruthSettings) -> dict[str, Any]:
+    """The thresholds of ground truth for JSON; null: the definition's own."""
+    return {
+        "cpa_radius_m": settings.cpa_radius_m,
+        "stopping_margin": settings.stopping_margin,
+        "ttc_bound_s": settings.ttc_bound_s,
+        "braking": settings.braking,
+    }
+
+
+def _differences(old: Side, new: Side, name: str, index: int) -> dict[str, Any]:
+    """What differs in a scenario whose script is the same on both sides."""
+    before, after = old.states[old.part(name)], new.states[new.part(name)]
+    truth, truth_new = old.suite.truths[old.suite.names.index(name)], new.suite.truths[index]
+    state = np.asarray(before != after)
+    labels = (truth.danger != truth_new.danger) | (truth.actionable != truth_new.actionable)
+    return {
+        "scenario": name,
+        "what": "states" if state.any() else "ground truth",
+        "frames": len(before),
+        "frames_state": int(state.sum()),
+        "frames_truth": int(labels.sum()),
+        "spans": _spans(truth.time_s, state, before, after),
+    }
+
+
+def _spans(
+    time_s: npt.NDArray[np.float64],
+    differs: BoolArray,
+    before: npt.NDArray[np.int8],
+    after: npt.NDArray[np.int8],
+) -> list[dict[str, Any]]:
+    """Runs of frames with the same change: from, to (s, both inclusive), state before and after."""
+    code = np.where(differs, before.astype(np.int64) * 8 + after, -1)
+    edges = np.nonzero(np.diff(code, prepend=-2))[0]
+    ends = [*edges[1:], len(code)]
+    return [
+        {
+            "from_s": number(round(float(time_s[a]), 4)),
+            "to_s": number(round(float(time_s[b - 1]), 4)),
+            "before": State(int(before[a])).name,
+            "after": State(int(after[a])).name,
+        }
+        for a, b in zip(edges, ends, strict=True)
+        if code[a] >= 0
+    ]
+
+
+def _float(text: str, said: str) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise BikepedError(f"{said}: {text!r} is not a number; write digits") from error
+    if not np.isfinite(value):
+        raise BikepedError(f"{said}: {text!r} is not a finite number; write digits")
+    return value

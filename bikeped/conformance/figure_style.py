@@ -1,0 +1,208 @@
+"""The look that all figures share: sheets with a title and a plain caption, colours, saving.
+
+Colours are Okabe and Ito's, told apart with every common colour blindness; beside them every
+series has its own marker, dash or hatch, so that a grey print reads the same.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import textwrap
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bikeped.errors import BikepedError
+from bikeped.types import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BLACK, GREY, LIGHT = "#1a1a1a", "#6b6b6b", "#d9d9d9"
+BLUE, SKY, GREEN, YELLOW = "#0072b2", "#56b4e9", "#009e73", "#f0e442"
+ORANGE, RED, PURPLE = "#e69f00", "#d55e00", "#cc79a7"
+#: One look a series, in order: colour, marker, dash.
+SERIES = (
+    (BLUE, "o", "-"),
+    (RED, "s", "--"),
+    (GREEN, "^", "-."),
+    (PURPLE, "D", ":"),
+    (ORANGE, "v", (0, (5, 1, 1, 1, 1, 1))),
+    (SKY, "P", (0, (1, 1))),
+    (BLACK, "X", (0, (8, 2))),
+)
+_SETTINGS: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.0,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": BLACK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#e3e3e3",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.6,
+    "lines.markersize": 5.0,
+    "hatch.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "xtick.color": BLACK,
+    "ytick.color": BLACK,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "bikeped",
+}
+DPI = 160
+_TITLE_PT, _CAPTION_PT, _MARGIN_IN = 11.5, 8.5, 0.12
+
+
+def require_matplotlib() -> None:
+    """BikepedError with the mend when the drawing library is not installed."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise BikepedError(
+            'matplotlib: not installed, and figures need it; pip install "bikeped[sim]"'
+        ) from error
+
+
+class Sheet:
+    """One figure: title on top, panels, caption below. Use as a context manager around drawing.
+
+    `width` and `height` in inches are those of the panels with their labels; title and caption
+    come on top of them, and `legend_rows` lines of a legend between panels and caption.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        caption: str,
+        width: float = 7.0,
+        height: float = 3.8,
+        rows: int = 1,
+        columns: int = 1,
+        legend_rows: int = 0,
+        **subplots: Any,
+    ) -> None:
+        require_matplotlib()
+        import matplotlib as mpl
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self._context = mpl.rc_context({**mpl.rcParamsDefault, **_SETTINGS})
+        self._context.__enter__()
+        title_lines = textwrap.wrap(title, int(width * 11.2)) or [""]
+        lines = textwrap.wrap(caption, int(width * 15.6))
+        above = len(title_lines) * _TITLE_PT * 1.3 / 72 + _MARGIN_IN
+        below = len(lines) * _CAPTION_PT * 1.4 / 72 + 2 * _MARGIN_IN
+        self._legend_at = below
+        below += legend_rows * 0.2 + (0.06 if legend_rows else 0.0)
+        total = height + above + below
+        self._legend_at /= total
+        self.figure: Figure = Figure(figsize=(width, total), dpi=DPI)
+        FigureCanvasAgg(self.figure)
+        self.figure.set_layout_engine(
+            "constrained",
+            rect=(0.008, below / total, 0.984, height / total),
+            w_pad=0.06,
+            h_pad=0.05,
+        )
+        left = _MARGIN_IN / width
+        self.figure.text(
+            left,
+            1 - _MARGIN_IN / total,
+            # Names of scenarios are anybody's: a dollar sign is not mathematics.
+            plain("\n".join(title_lines)),
+            fontsize=_TITLE_PT,
+            fontweight="bold",
+            va="top",
+            color=BLACK,
+        )
+        self.figure.text(
+            left,
+            _MARGIN_IN / total,
+            plain("\n".join(lines)),
+            fontsize=_CAPTION_PT,
+            va="bottom",
+            color="#3d3d3d",
+            linespacing=1.3,
+        )
+        grid = self.figure.subplots(rows, columns, squeeze=False, **subplots)
+        self.axes: list[Axes] = list(grid.ravel())
+
+    def __enter__(self) -> Sheet:
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self._context.__exit__(None, None, None)
+
+    def legend(self, handles: Sequence[Any] | None = None, columns: int = 4) -> None:
+        """One legend for all panels in the lines kept free for it (`legend_rows`)."""
+        if handles is None:
+            handles, labels = self.axes[0].get_legend_handles_labels()
+        else:
+            labels = [str(h.get_label()) for h in handles]
+        found = self.figure.legend(
+            handles,
+            labels,
+            loc="lower center",
+            bbox_to_anchor=(0.5, self._legend_at),
+            borderaxespad=0.0,
+            borderpad=0.1,
+            ncols=min(columns, max(len(labels), 1)),
+            handlelength=2.6,
+        )
+        found.set_in_layout(False)
+
+    def save(self, folder: Path, stem: str) -> list[Path]:
+        """PNG and PDF of the sheet; the same drawing gives the same bytes, for dates are left out.
+
+        BikepedError names a file that cannot be written.
+        """
+        paths = []
+        for kind, metadata in (
+            ("png", {"Software": None}),
+            ("pdf", {"CreationDate": None, "ModDate": None, "Producer": None, "Creator": None}),
+        ):
+            data = io.BytesIO()
+            self.figure.savefig(data, format=kind, metadata=metadata)
+            path = folder / f"{stem}.{kind}"
+            try:
+                path.write_bytes(data.getvalue())
+            except OSError as error:
+                raise BikepedError(
+                    f"{path}: cannot be written ({error.strerror}); choose a folder that exists"
+                ) from error
+            paths.append(path)
+        return paths
+
+
+def plain(text: str) -> str:
+    """Text as it is: matplotlib takes what stands between two dollar signs for mathematics."""
+    return text.replace("$", r"\$")
+
+
+def reals(values: Iterable[float | None], scale: float = 1.0) -> FloatArray:
+    """Figures from JSON as an array; null is NaN, which leaves a gap."""
+    return np.asarray([math.nan if v is None else scale * v for v in values], dtype=np.float64)
+
+
+def percents(values: Iterable[float | None]) -> FloatArray:
+    """Shares from JSON in per cent."""
+    return reals(values, 100.0)
+
+
+def stem_of(name: str) -> str:
+    """A file name from a scenario's name, which may hold anything."""
+    words = "".join(c.lower() if c.isascii() and c.isalnum() else " " for c in name).split()
+    return "-".join(words)[:60] or "scenario"

@@ -1,0 +1,95 @@
+"""The deployment gates (definitions, section 10; paper, section 4).
+
+Provisional design targets, as the paper says: they tell a configuration that fails by design from
+one that does not, and say nothing of rain, darkness or real people.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bikeped.conformance.metrics import Metrics, number
+from bikeped.conformance.truth import PEDESTRIAN_PRT_S
+
+SENSITIVITY_MIN = 0.90
+SPECIFICITY_MIN = 0.90
+#: The mean warning budget must exceed the distracted pedestrian's reaction time, s.
+BUDGET_ABOVE_S = PEDESTRIAN_PRT_S
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One gate: `measured` is NaN where there was nothing to measure, and then it does not hold.
+
+    `strict`: the measured figure must exceed `required`, not only reach it. `unit` is `%` (the
+    figures are shares) or `s`.
+    """
+
+    name: str
+    required: float
+    measured: float
+    holds: bool
+    unit: str
+    strict: bool = False
+
+    def say(self, value: float) -> str:
+        """A figure of this gate in its unit; one that fails never reads like one that holds.
+
+        89.96 % must not read 90.0 % beside a gate of 90 %.
+        """
+        if not math.isfinite(value):
+            return "nothing to measure"
+        scale, digits = (100.0, 1) if self.unit == "%" else (1.0, 2)
+        shown = round(value * scale, digits)
+        while value < self.required and shown >= round(self.required * scale, digits):
+            digits += 1
+            shown = math.floor(value * scale * 10**digits) / 10**digits
+        return f"{shown:.{digits}f} {self.unit}"
+
+    @property
+    def rule(self) -> str:
+        """What is required, in words."""
+        return f"{'above' if self.strict else 'at least'} {self.say(self.required)}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "name": self.name,
+            "required": self.required,
+            "strict": self.strict,
+            "unit": self.unit,
+            "measured": number(self.measured),
+            "holds": self.holds,
+        }
+
+
+def check(metrics: Metrics) -> list[Gate]:
+    """All gates of a suite's metrics.
+
+    Sensitivity counts the actionable frames of all scenarios together, as the definition has it.
+    """
+    return check_figures(metrics.as_dict())
+
+
+def check_figures(figures: Mapping[str, Any]) -> list[Gate]:
+    """As `check`, from the JSON of metrics (null: nothing was measured)."""
+
+    def gate(name: str, key: str, required: float, unit: str, strict: bool = False) -> Gate:
+        value = figures.get(key)
+        measured = math.nan if value is None else float(value)
+        holds = measured > required if strict else measured >= required
+        return Gate(name, required, measured, holds, unit, strict)
+
+    return [
+        gate("Sensitivity over actionable frames", "sensitivity", SENSITIVITY_MIN, "%"),
+        gate("Specificity", "specificity", SPECIFICITY_MIN, "%"),
+        gate("Mean warning budget", "mean_warning_budget_s", BUDGET_ABOVE_S, "s", strict=True),
+    ]
+
+
+def all_hold(gates: list[Gate]) -> bool:
+    """Whether a configuration may be promoted."""
+    return all(gate.holds for gate in gates)

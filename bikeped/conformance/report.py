@@ -1,0 +1,311 @@
+"""One page that a city engineer can read: what was tested, what came out, what it does not say.
+
+The page is plain HTML with relative links and no script; it follows the reader's light or dark
+setting and prints on paper.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import quote
+
+from bikeped.conformance.figures import FIGURES
+from bikeped.conformance.gates import all_hold, check_figures
+from bikeped.conformance.register import from_figures
+from bikeped.conformance.tables import Cell, Result, Table
+from bikeped.errors import BikepedError
+
+#: The configuration whose verdict the page gives: the one in force, or else the paper's.
+_JUDGED = ("deployed", "selected")
+_CSS = """
+:root{--ink:#1c1c1c;--soft:#55585c;--paper:#fff;--line:#d8dadd;--tint:#f4f5f7;--good:#00614a;
+--bad:#a33b00;--link:#005a8e}
+@media (prefers-color-scheme:dark){:root{--ink:#e8e8e8;--soft:#a9adb3;--paper:#16181b;
+--line:#3a3e44;--tint:#1f2226;--good:#5fd3ae;--bad:#ff9d66;--link:#7cc4f0}}
+*{box-sizing:border-box}
+body{margin:0 auto;padding:1.5rem 1rem 4rem;max-width:62rem;background:var(--paper);
+color:var(--ink);font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
+h1{font-size:1.75rem;line-height:1.2;margin:.4rem 0 .6rem}
+h2{font-size:1.25rem;margin:2.4rem 0 .5rem;padding-top:.6rem;border-top:1px solid var(--line)}
+h3{font-size:1.02rem;margin:1.6rem 0 .3rem}
+p{max-width:46rem;margin:.4rem 0 .8rem}
+a{color:var(--link)}
+nav ul{display:flex;flex-wrap:wrap;gap:.2rem 1.1rem;padding:0;margin:.6rem 0;list-style:none}
+.verdict{font-size:1.08rem;border-left:.35rem solid var(--good);background:var(--tint);
+padding:.7rem 1rem;margin:1rem 0}
+.verdict.bad{border-color:var(--bad)}
+.yes{color:var(--good);font-weight:600}.no{color:var(--bad);font-weight:600}
+.scroll{overflow-x:auto}
+table{border-collapse:collapse;font-size:.88rem;margin:.4rem 0;font-variant-numeric:tabular-nums}
+caption{text-align:left;font-weight:600;padding:.3rem 0}
+th,td{padding:.28rem .65rem;border-bottom:1px solid var(--line);text-align:left;vertical-align:top}
+th{font-weight:600;border-bottom:2px solid var(--line)}
+td.n,th.n{text-align:right;white-space:nowrap}
+figure{margin:1.4rem 0}
+figure img{max-width:100%;height:auto;background:#fff;border:1px solid var(--line);
+border-radius:4px}
+figcaption{max-width:46rem;margin-top:.4rem}
+.note{color:var(--soft);font-size:.88rem}
+code,pre{font-family:ui-monospace,Menlo,Consolas,monospace;font-size:.86rem}
+pre{background:var(--tint);border:1px solid var(--line);border-radius:4px;padding:.7rem;
+overflow-x:auto}
+dl{display:grid;grid-template-columns:max-content 1fr;gap:.15rem 1rem}
+dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
+@media print{body{max-width:none;font-size:10.5pt;padding:0;--paper:#fff;--ink:#000;--soft:#444;
+--line:#bbb;--tint:#f4f4f4;--good:#00614a;--bad:#a33b00;--link:#000}
+nav{display:none}figure,tr{break-inside:avoid}h2,h3{break-after:avoid}
+.scroll{overflow:visible}table{font-size:8pt}a{text-decoration:none}}
+"""
+
+
+def write_index(
+    folder: Path, results: list[Result], figures: list[Path], provenance: dict[str, str]
+) -> Path:
+    """Writes `index.html` into `folder`, linking figures (and tables, where they lie there) by
+    relative paths; returns its path. BikepedError names a file that cannot be written."""
+    found = {r.name: r for r in results}
+    sections = [
+        ("verdict", "Verdict", _verdict(found)),
+        ("tested", "What was tested", _tested(found, provenance)),
+        ("figures", "Figures", _figures(folder, figures)),
+        ("tables", "Tables", _tables(folder, results)),
+        ("risks", "Residual risks", _risks(found, provenance)),
+        ("provenance", "Provenance", _definitions(provenance)),
+        ("contest", "Run it again, or contest it", _rerun(provenance)),
+    ]
+    links = "".join(f'<li><a href="#{key}">{escape(name)}</a></li>' for key, name, _ in sections)
+    body = "\n".join(
+        f'<section id="{key}"><h2>{escape(name)}</h2>\n{content}</section>'
+        for key, name, content in sections
+    )
+    page = (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f"<title>Conformance report</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
+        "<header><h1>Does the crossing warn in time?</h1>\n"
+        "<p>Conformance report of a bikeped warning light: its decision rule, run through scripted "
+        "encounters of cyclists and pedestrians.</p></header>\n"
+        f'<nav aria-label="Sections"><ul>{links}</ul></nav>\n<main>\n{body}\n</main>\n'
+        "</body>\n</html>\n"
+    )
+    path = folder / "index.html"
+    _write(path, page)
+    return path
+
+
+def _verdict(found: Mapping[str, Result]) -> str:
+    """The gates of the configuration in force, in one sentence and a table."""
+    name, figures = _judged(found)
+    if figures is None:
+        return "<p>No comparison was run, so there is no verdict on the gates.</p>\n"
+    gates = check_figures(figures)
+    holds = all_hold(gates)
+    failed = " and ".join(g.name.lower() for g in gates if not g.holds)
+    text = (
+        "passes all gates. It may be promoted to a pole, within the limits below."
+        if holds
+        else f"fails: {failed}. It may not be promoted to a pole."
+    )
+    rows = "".join(
+        f"<tr><td>{escape(g.name)}</td><td class=n>{escape(g.rule)}</td>"
+        f"<td class=n>{escape(g.say(g.measured))}</td>"
+        f"<td class={'yes' if g.holds else 'no'}>{'holds' if g.holds else 'fails'}</td></tr>"
+        for g in gates
+    )
+    return (
+        f'<p class="verdict{"" if holds else " bad"}">The configuration '
+        f"<b>{escape(name)}</b> {escape(text)}</p>\n"
+        "<table><thead><tr><th>Gate</th><th class=n>Required</th><th class=n>Measured</th>"
+        f"<th>Verdict</th></tr></thead><tbody>{rows}</tbody></table>\n"
+        "<p class=note>Sensitivity: share of the moments of danger, in which a warning can still "
+        "help, that had an alert. Specificity: share of the moments without danger that had none. "
+        "Warning budget: time from the alert to the closest approach. The gates are provisional "
+        "design targets, not acceptance criteria of a field test.</p>\n"
+    )
+
+
+def _judged(found: Mapping[str, Result]) -> tuple[str, Mapping[str, Any] | None]:
+    result = found.get("compare")
+    configurations = result.data.get("configurations", {}) if result is not None else {}
+    name = next((n for n in _JUDGED if n in configurations), next(iter(configurations), ""))
+    return name, configurations.get(name)
+
+
+def _tested(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+    data = found["compare"].data if "compare" in found else {}
+    count = data.get("scenarios", provenance.get("scenarios", "a set of"))
+    camera = data.get("camera", {})
+    where = ""
+    if camera:
+        where = (
+            f" The camera hangs {float(camera['height_m']):.2f} m high with a pitch of "
+            f"{float(camera['pitch_deg']):g}° and sees {float(camera['fov_deg']):.1f}°."
+        )
+    return (
+        f"<p>{escape(str(count))} scripted encounters went through the tracker and the decision "
+        "rule of the pole, with the errors that its camera makes in placing people."
+        f"{escape(where)} The scripts are conformance cases that name kinds of encounter; they are "
+        "not a sample of traffic, and no percentage here is a percentage of real encounters.</p>\n"
+        "<p>Not tested are the light, the sound, and whether people heed them; the detector itself "
+        "appears only through its measured recall.</p>\n"
+    )
+
+
+def _figures(folder: Path, figures: Sequence[Path]) -> str:
+    """Each picture once, with two sentences and a link to its PDF."""
+    stems = list(dict.fromkeys(p.with_suffix("") for p in figures))
+    order = list(FIGURES)
+    stems.sort(key=lambda p: order.index(p.name) if p.name in FIGURES else len(order))
+    parts = []
+    for stem in stems:
+        text = FIGURES.get(stem.name)
+        title = text.title if text is not None else stem.name.replace("-", " ").replace("_", " ")
+        said = text.explained if text is not None else ""
+        files = {p.suffix: p for p in figures if p.with_suffix("") == stem}
+        picture = files.get(".png", files.get(".svg"))
+        image = ""
+        if picture is not None:
+            image = f'<img src="{_href(folder, picture)}" alt="{escape(title)}" loading="lazy">'
+        links = ", ".join(
+            f'<a href="{_href(folder, p)}">{escape(p.suffix[1:].upper())}</a>'
+            for p in files.values()
+        )
+        parts.append(
+            f"<figure><h3>{escape(title)}</h3>{image}<figcaption>{escape(said)} "
+            f"<span class=note>{links}</span></figcaption></figure>\n"
+        )
+    return "".join(parts) or "<p>No figures were drawn.</p>\n"
+
+
+def _tables(folder: Path, results: Iterable[Result]) -> str:
+    parts = []
+    for result in results:
+        for table in result.tables:
+            file = next(
+                (p for p in _places(folder, table.name) if p.is_file()),
+                None,
+            )
+            link = f' <a href="{_href(folder, file)}">CSV</a>' if file is not None else ""
+            parts.append(_table(table, link))
+    return "".join(parts) or "<p>No tables.</p>\n"
+
+
+def _places(folder: Path, name: str) -> list[Path]:
+    """Where a table's CSV may lie beside the page."""
+    file = f"{name}.csv"
+    return [folder / file, folder / "tables" / file]
+
+
+def _table(table: Table, link: str = "") -> str:
+    numeric = [
+        any(_is_number(row[i]) for row in table.rows) and all(_numberish(r[i]) for r in table.rows)
+        for i in range(len(table.columns))
+    ]
+    mark = [" class=n" if n else "" for n in numeric]
+    head = "".join(f"<th{m}>{escape(c)}</th>" for m, c in zip(mark, table.columns, strict=True))
+    rows = "".join(
+        "<tr>"
+        + "".join(f"<td{m}>{escape(_text(c))}</td>" for m, c in zip(mark, row, strict=True))
+        + "</tr>"
+        for row in table.rows
+    )
+    note = f"<p class=note>{escape(table.note)}</p>\n" if table.note else ""
+    return (
+        f"<div class=scroll><table><caption>{escape(table.title)}{link}</caption>"
+        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>\n{note}"
+    )
+
+
+def _risks(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+    _, figures = _judged(found)
+    by_scenario = (figures or {}).get("by_scenario", {})
+    register = from_figures(by_scenario, {}, provenance.get("suite_hash", ""))
+    hazards, scenarios = register.tables()
+    parts = [
+        "<p>What the system does not or only partly answer. Field-blocking: more evidence is "
+        "needed before it runs unsupervised; monitor: data have to be collected in the field.</p>\n",
+        _table(hazards),
+    ]
+    if by_scenario:
+        # The hazard classes are in the scenario files, which this page does not have.
+        columns = [i for i, c in enumerate(scenarios.columns) if c != "Hazard"]
+        parts.append(
+            _table(
+                Table(
+                    scenarios.name,
+                    scenarios.title,
+                    tuple(scenarios.columns[i] for i in columns),
+                    [tuple(row[i] for i in columns) for row in scenarios.rows],
+                    scenarios.note,
+                )
+            )
+        )
+    return "".join(parts)
+
+
+def _definitions(items: Mapping[str, str]) -> str:
+    rows = "".join(
+        f"<dt>{escape(str(k).replace('_', ' '))}</dt><dd><code>{escape(str(v))}</code></dd>"
+        for k, v in items.items()
+    )
+    return f"<dl>{rows}</dl>\n<p class=note>The same hashes mean the same inputs.</p>\n"
+
+
+def _rerun(provenance: Mapping[str, str]) -> str:
+    command = provenance.get("command", "bikeped conformance reproduce")
+    return (
+        "<p>Everything here can be made again on any computer, without a camera:</p>\n"
+        f"<pre>{escape(command)}</pre>\n"
+        "<p>Who thinks that a case is missing, that a parameter is wrong, or that danger should be "
+        "defined otherwise, can say so with a file or a number, and see what it changes:</p>\n"
+        "<pre>bikeped conformance contest --scenario my-crossing.yaml\n"
+        "bikeped conformance contest --set decision.d_max_m=15\n"
+        "bikeped conformance contest --truth cpa_radius_m=7\n"
+        "bikeped conformance contest --bound d_max_m=..20</pre>\n"
+        "<p>Each prints the figures before and after, and the line with which anybody else gets "
+        "the same.</p>\n"
+    )
+
+
+def _href(folder: Path, path: Path) -> str:
+    """A relative link that stays valid when the folder is moved."""
+    relative = os.path.relpath(path, folder)
+    return escape(quote(PurePosixPath(Path(relative).as_posix()).as_posix()))
+
+
+def _is_number(cell: Cell) -> bool:
+    return isinstance(cell, (int, float)) and not isinstance(cell, bool)
+
+
+def _numberish(cell: Cell) -> bool:
+    return cell is None or cell == "" or _is_number(cell)
+
+
+def _text(cell: Cell) -> str:
+    if cell is None:
+        return "–"
+    return f"{cell:g}" if isinstance(cell, float) else str(cell)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        handle, name = tempfile.mkstemp(prefix=".index.", dir=path.parent)
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            Path(name).chmod(0o644)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise BikepedError(
+            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and that "
+            "you may write"
+        ) from error
