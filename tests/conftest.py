@@ -1,4 +1,5 @@
-"""A real mosquitto, a proxy that can misbehave before it, and a subscriber."""
+"""What tests of several packages share: a real mosquitto with a proxy that can misbehave before it
+and a subscriber; a small camera with its clip, model and configuration."""
 
 from __future__ import annotations
 
@@ -13,7 +14,13 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
 import aiomqtt
+import numpy as np
+import onnx
 import pytest
+import simplejpeg
+from onnx import TensorProto, helper, numpy_helper
+
+from bikeped.demo.avi import AviWriter
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
 DEADLINE_S = 30.0  # generous: reached only by a failure
@@ -191,3 +198,86 @@ def listen() -> Callable[..., contextlib.AbstractAsyncContextManager[Listener]]:
             yield Listener(client)
 
     return subscribe
+
+
+# --- a small crossing: camera, clip and model that every service and command-line test can afford
+
+SMALL_CONFIG = """
+camera:
+  source: {source}
+  width: 96
+  height: 64
+  projection: perspective
+  pad_size: null
+  crop_size: null
+  radius_px: 58
+  fov_deg: 73
+  height_m: 5.0
+  pitch_deg: -35
+detection: {{model: {model}, providers: [cpu], threads: 1, rider_overlap: 1.0}}
+mqtt: {{health_interval_s: 0.2}}
+"""
+
+
+@pytest.fixture(scope="session")
+def small_jpegs() -> list[bytes]:
+    """Eight pictures of 96 x 64 that differ."""
+    v, u = np.mgrid[0:64, 0:96]
+    pictures = []
+    for n in range(8):
+        rgb = np.stack([u * 2, v * 3, (u + v + 20 * n) % 200], axis=2).astype(np.uint8)
+        pictures.append(simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), colorspace="RGB"))
+    return pictures
+
+
+@pytest.fixture
+def make_clip(tmp_path: Path, small_jpegs: list[bytes]) -> Callable[..., Path]:
+    """Writes a Motion JPEG AVI; `pictures` are used in turn."""
+
+    def make(name: str, frames: int, pictures: list[bytes] | None = None, fps: int = 30) -> Path:
+        turn = pictures or small_jpegs
+        path = tmp_path / name
+        with AviWriter(path, fps, (96, 64)) as clip:
+            for number in range(frames):
+                clip.write(turn[number % len(turn)])
+        return path
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real ONNX model that sees one pedestrian, 7 m ahead, in every picture."""
+    anchors = 12 * 8 + 6 * 4 + 3 * 2  # of strides 8, 16 and 32 on 96 x 64
+    answer = np.zeros((1, 4 + 2, anchors), np.float32)
+    answer[0, :, 5] = (48, 22, 10, 26, 0.9, 0.0)  # cx cy w h, person, bicycle
+    graph = helper.make_graph(
+        [helper.make_node("Identity", ["answer"], ["output0"])],
+        "one pedestrian",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 64, 96))],
+        [helper.make_tensor_value_info("output0", TensorProto.FLOAT, answer.shape)],
+        [numpy_helper.from_array(answer, "answer")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    for key, value in {
+        "names": "{0: 'person', 1: 'bicycle'}",
+        "task": "detect",
+        "imgsz": "[64, 96]",
+    }.items():
+        model.metadata_props.add(key=key, value=value)
+    path = tmp_path_factory.mktemp("model") / "pedestrian.onnx"
+    onnx.save(model, path)
+    return path
+
+
+@pytest.fixture
+def small_config(tmp_path: Path, small_model: Path) -> Callable[..., Path]:
+    """Writes a configuration for the small camera; keywords are more lines of YAML."""
+
+    def make(source: Path | str = "/dev/video-none", more: str = "", model: object = None) -> Path:
+        path = tmp_path / "small.yaml"
+        text = SMALL_CONFIG.format(source=source, model=model or small_model)
+        path.write_text(text + more, encoding="utf-8")
+        return path
+
+    return make

@@ -1,0 +1,236 @@
+"""Fakes at the seams of the loop: a feed, an eye, a light, a clock, and one who listens."""
+
+from __future__ import annotations
+
+import asyncio
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from bikeped.config import LoadedConfig, parse_config
+from bikeped.detection.base import DetectorAnswer
+from bikeped.feedback import SignalLogic
+from bikeped.service.announcer import Announcer
+from bikeped.service.judge import Judge
+from bikeped.service.loop import Limits, Loop, Outcome
+from bikeped.service.vision import Picture, Vision
+from bikeped.types import Decision, Detections, Frame, Kind, Signal
+
+PATIENCE_S = 20.0  # reached only by a failure
+
+CONFIG = """
+camera: {width: 96, height: 64, projection: perspective, pad_size: null, crop_size: null,
+         radius_px: 58, fov_deg: 73, height_m: 5.0, pitch_deg: -35}
+"""
+RGB = np.zeros((64, 96, 3), np.uint8)
+
+
+def small(*overrides: str) -> LoadedConfig:
+    from pathlib import Path
+
+    return parse_config(CONFIG, "small.yaml", Path(), overrides)
+
+
+def seen(*objects: tuple[Kind, float, float]) -> Detections:
+    """Detections whose boxes end at the given pixels."""
+    n = len(objects)
+    box = np.array([(u - 3, v - 10, u + 3, v) for _, u, v in objects], np.float32).reshape(n, 4)
+    kind = np.array([kind for kind, _, _ in objects], np.int8)
+    return Detections(kind, np.full(n, 0.9, np.float32), box)
+
+
+class Clock:
+    def __init__(self, now_s: float = 100.0) -> None:
+        self.now_s = now_s
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class FakeFeed:
+    """Hands out what the test puts in."""
+
+    def __init__(self, live: bool = True) -> None:
+        self.live = live
+        self.queue: asyncio.Queue[Frame | None | Exception] = asyncio.Queue()
+        self.last_s: float | None = None
+        self.trouble: str | None = None
+        self.hang_s = 0.0
+        self.restarts = 0
+        self.closed = False
+        self.number = 0
+
+    def put(self, captured_s: float, **changes: object) -> None:
+        self.last_s = captured_s
+        values = {"width": 96, "height": 64, "rgb": RGB, **changes}
+        if "jpeg" in changes:
+            values["rgb"] = None
+        self.queue.put_nowait(Frame(self.number, captured_s, **values))  # type: ignore[arg-type]
+        self.number += 1
+
+    async def next(self) -> tuple[Frame, float] | None:
+        item = await self.queue.get()
+        if isinstance(item, Exception):
+            raise item
+        return None if item is None else (item, 1.0)
+
+    def newest_s(self, now_s: float) -> float | None:
+        return self.last_s
+
+    def dropped(self) -> int:
+        return 0
+
+    def hung_s(self, now_s: float) -> float:
+        return self.hang_s
+
+    def error(self) -> str | None:
+        return self.trouble
+
+    def restart(self) -> None:
+        self.restarts += 1
+
+    async def close(self) -> None:
+        self.closed = True
+
+
+class FakeEye:
+    """Sees `answer`; raises `error` while there is one; blocks while `go` is not set."""
+
+    name = "fake"
+    model_hash: str | None = None
+
+    def __init__(self, answer: Detections | None = None) -> None:
+        self.answer = Detections.empty() if answer is None else answer
+        self.error: Exception | None = None
+        self.go = threading.Event()
+        self.go.set()
+        self.entered = threading.Event()
+        self.looks = 0
+
+    def decode_size(self, width: int, height: int) -> tuple[int, int]:
+        return width, height
+
+    def see(self, picture: Picture) -> DetectorAnswer:
+        self.looks += 1
+        self.entered.set()
+        self.go.wait(PATIENCE_S)
+        if self.error is not None:
+            raise self.error
+        return DetectorAnswer(self.answer, 0.1, 1.0, 0.1)
+
+
+class FakeLight:
+    """What `LightDriver.show` was called with."""
+
+    def __init__(self) -> None:
+        self.shown: list[Signal] = []
+
+    def show(self, signal: Signal) -> None:
+        self.shown.append(signal)
+
+
+class Recorder:
+    """Listens to signals, outcomes and ticks, and lets a test wait for them."""
+
+    def __init__(self) -> None:
+        self.signals: list[tuple[Signal, str, Decision | None]] = []
+        self.outcomes: list[Outcome] = []
+        self.ticks = 0
+        self._news = asyncio.Event()
+
+    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+        self.signals.append((signal, sentence, decision))
+        self._news.set()
+
+    async def frame(self, outcome: Outcome) -> None:
+        self.outcomes.append(outcome)
+        self._news.set()
+
+    def tick(self) -> None:
+        self.ticks += 1
+        self._news.set()
+
+    async def until(self, done: Callable[[], bool]) -> None:
+        async def wait() -> None:
+            while not done():
+                self._news.clear()
+                await self._news.wait()
+
+        await asyncio.wait_for(wait(), PATIENCE_S)
+
+    async def some_ticks(self) -> None:
+        """Until two whole ticks have passed: whatever was to be noticed has been."""
+        target = self.ticks + 2
+        await self.until(lambda: self.ticks >= target)
+
+    @property
+    def name(self) -> str:
+        return self.signals[-1][0].name if self.signals else ""
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        return self.signals[-1][0].faults
+
+
+class Rig:
+    """A loop with fakes at every seam; `async with` runs it."""
+
+    def __init__(self, *, live: bool = True, config: LoadedConfig | None = None) -> None:
+        self.config = config or small()
+        self.clock = Clock()
+        self.feed = FakeFeed(live)
+        self.eye = FakeEye()
+        self.light = FakeLight()
+        self.recorder = Recorder()
+        self.outputs: list[object] = [self.recorder]
+        self.limits = Limits(tick_s=0.005, close_s=0.05)
+        self.judge = Judge(self.config)
+
+    def start(self) -> None:
+        self.announcer = Announcer(
+            SignalLogic.from_config(self.config.config.feedback),
+            self.light,  # type: ignore[arg-type]
+            listeners=(self.recorder,),
+        )
+        self.loop = Loop(
+            feed=self.feed,
+            vision=Vision(self.eye),
+            judge=self.judge,
+            announcer=self.announcer,
+            outputs=self.outputs,  # type: ignore[arg-type]
+            limits=self.limits,
+            clock=self.clock,
+            on_tick=self.recorder.tick,
+        )
+        self.task = asyncio.create_task(self.loop.run())
+
+    async def __aenter__(self) -> Rig:
+        self.start()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self.eye.go.set()
+        self.task.cancel()
+        await asyncio.gather(self.task, return_exceptions=True)
+
+    async def frames(self, count: int, step_s: float = 1 / 30, **changes: object) -> None:
+        """Puts frames of the present moment in and waits for each to be dealt with."""
+        for _ in range(count):
+            self.clock.now_s += step_s
+            before = self.dealt_with()
+            self.feed.put(self.clock.now_s, **changes)
+            await self.recorder.until(lambda before=before: self.dealt_with() > before)
+
+    def dealt_with(self) -> int:
+        counts = self.loop.counts
+        return counts.frames + counts.undecodable + counts.failed + counts.out_of_order
+
+    async def well(self) -> None:
+        """Until the light says IDLE."""
+        await self.frames(6)
+        assert self.recorder.name == "IDLE"
+
+    async def ended(self) -> None:
+        await asyncio.wait_for(self.task, PATIENCE_S)

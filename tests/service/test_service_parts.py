@@ -1,0 +1,185 @@
+"""Worker, seldom log lines, feeds, vision: the small parts that the loop stands on."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from service_fakes import PATIENCE_S, Clock, FakeEye
+
+from bikeped.capture import FrameGrabber, open_source
+from bikeped.errors import CaptureError
+from bikeped.service.feed import LiveFeed, RecordedFeed
+from bikeped.service.seldom import Seldom
+from bikeped.service.systemd import Notifier
+from bikeped.service.vision import Vision
+from bikeped.service.workers import Worker
+from bikeped.types import Frame
+
+
+async def test_a_worker_answers_in_order_and_passes_errors_on():
+    worker = Worker("test")
+    assert await asyncio.gather(*(worker.submit(pow, n, 2) for n in range(5))) == [0, 1, 4, 9, 16]
+    with pytest.raises(ZeroDivisionError):
+        await worker.submit(divmod, 1, 0)
+    assert await worker.submit(len, "still alive") == 11
+    assert await worker.close()
+
+
+async def test_a_worker_that_hangs_says_so_and_is_left_behind():
+    clock, go, entered = Clock(), threading.Event(), threading.Event()
+    worker = Worker("test", clock)
+
+    def hang() -> None:
+        entered.set()
+        go.wait(PATIENCE_S)
+
+    assert worker.busy_s(clock()) == 0.0
+    call = worker.submit(hang)
+    try:
+        assert await asyncio.to_thread(entered.wait, PATIENCE_S)
+        clock.now_s += 20
+        assert worker.busy_s(clock()) == 20.0
+        assert not await worker.close(0.01)
+        assert worker._thread.daemon  # so it cannot keep the process
+    finally:
+        go.set()
+    await call
+    assert worker.busy_s(clock()) == 0.0
+
+
+async def test_a_cancelled_call_is_not_begun():
+    worker, go, done = Worker("test"), threading.Event(), []
+    first = worker.submit(go.wait, PATIENCE_S)
+    second = worker.submit(done.append, 1)
+    second.cancel()
+    go.set()
+    assert await first
+    assert await worker.submit(len, done) == 0
+    assert await worker.close()
+
+
+def test_thirty_failures_a_second_are_a_line_every_ten(caplog):
+    clock = Clock()
+    seldom = Seldom(logging.getLogger("seldom"), clock=clock)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(300):
+            seldom.warn("decode", "bad frame")
+            clock.now_s += 1 / 30
+        seldom.failure("output", OSError("full"))
+        clock.now_s += 0.5
+        seldom.warn("decode", "bad frame")
+    assert [record.getMessage() for record in caplog.records] == [
+        "bad frame",
+        "output: full",
+        "bad frame (and 299 more since the last such line)",
+    ]
+    assert caplog.records[1].exc_info
+
+
+async def test_a_recorded_feed_gives_every_frame_and_then_the_end(make_clip):
+    source = open_source(str(make_clip("c.avi", 7)), width=96, height=64, fps=30, fourcc="MJPG")
+    feed = RecordedFeed(source)
+    numbers = []
+    while (taken := await feed.next()) is not None:
+        numbers.append(taken[0].number)
+    assert numbers == list(range(7))
+    assert await feed.next() is None
+    await feed.close()
+
+
+class Slow:
+    """A source whose read returns when it is told to."""
+
+    name, width, height, fps, live = "slow", 96, 64, 30.0, True
+
+    def __init__(self) -> None:
+        self.go, self.entered, self.closed = threading.Event(), threading.Event(), False
+
+    def read(self) -> Frame | None:
+        self.entered.set()
+        self.go.wait(PATIENCE_S)
+        return None
+
+    def close(self) -> None:
+        self.closed = True
+
+
+async def test_a_recorded_feed_closes_its_source_after_the_read_under_way():
+    source = Slow()
+    feed = RecordedFeed(source)  # type: ignore[arg-type]
+    reading = asyncio.create_task(feed.next())
+    assert await asyncio.to_thread(source.entered.wait, PATIENCE_S)
+    reading.cancel()
+    source.go.set()
+    await feed.close()
+    assert source.closed
+
+
+async def test_a_live_feed_that_ended_says_so_and_one_that_broke_says_why(make_clip):
+    class Ends(Slow):
+        def read(self) -> Frame | None:
+            return None
+
+    grabber = FrameGrabber(Ends)  # type: ignore[arg-type]
+    grabber.start()
+    feed = LiveFeed(grabber)
+    assert await asyncio.wait_for(feed.next(), PATIENCE_S) is None
+    assert feed.newest_s(1.0) is None
+    assert feed.error() is None
+    await feed.close()
+
+    failed = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    def breaks() -> Slow:
+        loop.call_soon_threadsafe(failed.set)
+        raise CaptureError("/dev/video7: no such camera")
+
+    grabber = FrameGrabber(breaks)  # type: ignore[arg-type,return-value]
+    grabber.start()
+    feed = LiveFeed(grabber)
+    await asyncio.wait_for(failed.wait(), PATIENCE_S)
+    while feed.error() is None:  # set by the thread right after the call above
+        await asyncio.sleep(0)
+    assert feed.error() == "/dev/video7: no such camera"
+    await feed.close()
+
+
+VISION = Vision(FakeEye())
+
+
+@given(st.binary(max_size=2000))
+@settings(max_examples=200, deadline=None)
+def test_any_bytes_as_a_frame_are_refused_and_never_crash(data):
+    with pytest.raises(CaptureError):
+        VISION.decode(Frame(0, 0.0, 96, 64, jpeg=data), 0.0, 0.0)
+
+
+@given(st.data())
+@settings(max_examples=200, deadline=None)
+def test_a_damaged_jpeg_is_a_picture_or_refused(small_jpegs, data):
+    jpeg = bytearray(small_jpegs[0])
+    for _ in range(data.draw(st.integers(1, 8))):
+        jpeg[data.draw(st.integers(0, len(jpeg) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        picture = VISION.decode(Frame(0, 0.0, 96, 64, jpeg=bytes(jpeg)), 0.0, 0.0)
+    except CaptureError:
+        return
+    assert picture.rgb.dtype == np.uint8
+    assert picture.rgb.ndim == 3
+
+
+def test_without_a_service_manager_nothing_is_sent_and_nothing_fails():
+    notifier = Notifier("")
+    notifier.ready("up")
+    notifier.alive()
+    notifier.close()
+    gone = Notifier("/nowhere/notify")
+    gone.alive()
+    gone.close()

@@ -1,0 +1,202 @@
+"""What the loop tells the world, message by message, against the published schemas."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+from prometheus_client import generate_latest
+from service_fakes import Clock, Rig, seen, small
+
+from bikeped.feedback import SignalLogic
+from bikeped.service.announcer import Announcer
+from bikeped.service.health import health_line, tell_health
+from bikeped.service.telemetry import Telemetry
+from bikeped.telemetry.messages import Part, encode
+from bikeped.telemetry.metrics import Metrics
+from bikeped.types import Kind
+
+SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
+
+
+def valid(name, payload):
+    schema = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
+    message = json.loads(payload)
+    jsonschema.validate(
+        message, schema, format_checker=jsonschema.Draft202012Validator.FORMAT_CHECKER
+    )
+    return message
+
+
+class Publisher:
+    class status:  # noqa: N801
+        connected, dropped = True, 3
+
+    def __init__(self):
+        self.sent = []
+
+    def publish(self, topic, payload, *, retain=False, qos=None):
+        self.sent.append((topic, payload, retain, qos))
+
+    def of(self, topic):
+        return [valid(t, payload) for t, payload, _, _ in self.sent if t == topic]
+
+
+class Audit:
+    dropped = 0
+
+    def __init__(self):
+        self.lines = []
+
+    def write(self, line):
+        self.lines.append(line)
+
+
+class TelemetryRig(Rig):
+    def start(self):
+        self.publisher, self.audit, self.metrics = Publisher(), Audit(), Metrics()
+        self.wall = Clock(1.7e9)
+        self.interval = Clock(0.0)
+        self.telemetry = Telemetry(
+            self.config,
+            self.judge,
+            publisher=self.publisher,
+            audit=self.audit,
+            metrics=self.metrics,
+            wall_clock=self.wall,
+            clock=self.interval,
+        )
+        self.outputs = [self.telemetry, self.recorder]
+        super().start()
+        self.announcer._listeners = (self.telemetry, self.recorder)
+
+    async def frames(self, count, step_s=1 / 30, **changes):
+        for _ in range(count):
+            self.interval.now_s += step_s
+            await super().frames(1, step_s, **changes)
+
+
+async def test_state_is_published_at_changes_only_and_is_retained():
+    async with TelemetryRig() as rig:
+        await rig.well()
+        await rig.frames(30)
+        rig.loop.stop()
+        await rig.ended()
+        states = [m["state"] for m in rig.publisher.of("state")]
+        assert states == ["FAULT", "IDLE", "OFF"] or states == ["FAULT", "FAULT", "IDLE", "OFF"]
+        assert all(retain and qos == 1 for t, _, retain, qos in rig.publisher.sent if t == "state")
+        assert rig.publisher.of("state")[-1]["pair"] is None
+
+
+async def test_the_state_message_of_an_alert_has_that_frames_pair():
+    rig = TelemetryRig(config=small("decision.d_min_m=0.1", "decision.min_displacement_m=0.01"))
+    async with rig:
+        await rig.well()
+        for n in range(30):
+            rig.eye.answer = seen((Kind.PEDESTRIAN, 30, 30), (Kind.CYCLIST, 80 - n, 30))
+            await rig.frames(1)
+            if rig.recorder.name == "ALERT":
+                break
+        alert = rig.publisher.of("state")[-1]
+        line = rig.audit.lines[-1]
+        assert alert["state"] == line.state == "ALERT"
+        assert alert["pair"] == list(line.pair)
+        assert rig.telemetry.alerts == 1
+
+
+async def test_tracks_come_at_the_interval_with_the_time_of_capture():
+    async with TelemetryRig() as rig:
+        rig.eye.answer = seen((Kind.PEDESTRIAN, 48, 35))
+        await rig.frames(60)
+        messages = rig.publisher.of("tracks")
+        assert 18 <= len(messages) <= 21  # two seconds, ten a second
+        assert messages[-1]["objects"][0]["class"] == "pedestrian"
+        assert len(messages[-1]["objects"][0]["history"]) > 10
+        assert messages[-1]["timestamp"] < "2023-11-14T22:13:20.000Z"  # before now, which is this
+
+
+async def test_every_frame_is_a_line_of_the_audit_log():
+    async with TelemetryRig() as rig:
+        await rig.frames(10)
+        lines = [valid("event-frame", encode(line)) for line in rig.audit.lines]
+        assert [line["frame"] for line in lines] == list(range(10))
+        assert lines[0]["t"] == 0.0
+        assert lines[3]["light"] == "FAULT"
+        assert lines[9]["light"] == "IDLE"
+
+
+async def test_health_says_what_is_wrong_and_how_old_the_newest_frame_is(small_jpegs):
+    async with TelemetryRig() as rig:
+        part = Part(ok=True, detail="simulated")
+        valid("health", encode(rig.telemetry.health(rig.loop, part)))  # before any frame
+        await rig.well()
+        await rig.frames(1, jpeg=b"junk")
+        message = valid("health", encode(rig.telemetry.health(rig.loop, part, ("audit: full",))))
+        assert message["camera"]["ok"]
+        assert message["faults"] == ["audit: full"]
+        assert message["counters"]["undecodable"] == 1
+        assert message["counters"]["mqtt_dropped"] == 3
+        assert message["fps"] == 3.0  # six frames in the last two seconds
+        rig.clock.now_s += 3.0
+        await rig.recorder.some_ticks()
+        message = valid("health", encode(rig.telemetry.health(rig.loop, part)))
+        assert message["state"] == "FAULT"
+        assert not message["camera"]["ok"]
+        assert not message["detector"]["ok"]
+        assert message["camera"]["capture_age_ms"] == pytest.approx(3000, abs=50)
+        line = health_line(rig.telemetry.health(rig.loop, part))
+        for stage in ("acquire", "pre", "inference", "post", "track", "decide", "feedback"):
+            assert f"{stage} " in line
+        assert "total " in line
+        assert "capture_age " in line
+
+
+async def test_metrics_count_what_no_single_frame_tells():
+    async with TelemetryRig() as rig:
+        await rig.well()
+        await rig.frames(2, jpeg=b"junk")
+        for _ in range(2):  # totals, not sums of totals
+            rig.telemetry.measure(rig.loop, light_errors=4)
+        text = generate_latest(rig.metrics.registry).decode()
+        assert "bikeped_frames_undecodable_total 2.0" in text
+        assert "bikeped_light_faults_total 4.0" in text
+        assert "bikeped_mqtt_dropped_total 3.0" in text
+        assert "bikeped_frames_total 6.0" in text
+        assert 'bikeped_state{bikeped_state="IDLE"} 1.0' in text
+
+
+async def test_a_failing_health_report_costs_a_message_and_no_more(caplog):
+    import asyncio
+
+    rig = TelemetryRig()
+    async with rig:
+        calls = asyncio.Queue()
+
+        def health():
+            calls.put_nowait(1)
+            if calls.qsize() == 1:
+                raise ValueError("a bug")
+            return rig.telemetry.health(rig.loop, Part(ok=True, detail=""))
+
+        telling = asyncio.create_task(tell_health(rig.telemetry, rig.loop, health, 0.01))
+        try:
+            while not rig.publisher.of("health"):
+                assert not telling.done()
+                await rig.recorder.some_ticks()
+        finally:
+            telling.cancel()
+        assert "health: a bug" in caplog.text
+
+
+def test_the_announcer_refreshes_what_it_shows():
+    from service_fakes import FakeLight
+
+    light = FakeLight()
+    announcer = Announcer(SignalLogic(), light)  # type: ignore[arg-type]
+    announcer.refresh()
+    assert light.shown == []
+    announcer.off()
+    announcer.refresh()
+    assert [signal.name for signal in light.shown] == ["OFF", "OFF"]
