@@ -17,6 +17,7 @@ from bikeped import __version__
 from bikeped.config.build import ground_camera
 from bikeped.config.load import LoadedConfig
 from bikeped.config.sections import DecisionConfig
+from bikeped.errors import BikepedError
 
 #: What turns positions into a state on the pole; the simulation runs the very same code.
 DECIDING_CODE = ("decision", "geometry", "tracking")
@@ -105,10 +106,13 @@ def check_provenance(loaded: LoadedConfig) -> ProvenanceCheck:
             "figures do not hold; promote it, or put the promoted section back",
         )
     doubts = []
-    if camera_hash(loaded) != found.camera_hash:
-        doubts.append("the camera or its calibration is another one now")
-    if code_hash() != found.code_hash:
-        doubts.append(f"the deciding code is another one now ({found.version}, now {__version__})")
+    try:
+        if camera_hash(loaded) != found.camera_hash:
+            doubts.append("the camera or its calibration is another one now")
+        if code_hash() != found.code_hash:
+            doubts.append(f"the deciding code is another one now ({found.version}, {__version__})")
+    except (BikepedError, OSError) as error:
+        doubts.append(f"camera and code cannot be compared ({' '.join(str(error).split())})")
     text = (
         f"decision promoted {found.promoted_at}, suite {found.suite_hash[:12]} "
         f"({found.scenarios} scenarios), sensitivity {_percent(found, 'sensitivity')}, specificity "

@@ -203,17 +203,18 @@ def _places(folder: Path, name: str) -> list[Path]:
 
 
 def _table(table: Table, link: str = "") -> str:
-    numeric = [
-        any(_is_number(row[i]) for row in table.rows) and all(_numberish(r[i]) for r in table.rows)
-        for i in range(len(table.columns))
+    columns = [[row[i] for row in table.rows] for i in range(len(table.columns))]
+    texts = [_column(cells) for cells in columns]
+    mark = [
+        " class=n" if any(map(_is_number, cells)) and all(map(_numberish, cells)) else ""
+        for cells in columns
     ]
-    mark = [" class=n" if n else "" for n in numeric]
     head = "".join(f"<th{m}>{escape(c)}</th>" for m, c in zip(mark, table.columns, strict=True))
     rows = "".join(
         "<tr>"
-        + "".join(f"<td{m}>{escape(_text(c))}</td>" for m, c in zip(mark, row, strict=True))
+        + "".join(f"<td{m}>{escape(column[r])}</td>" for m, column in zip(mark, texts, strict=True))
         + "</tr>"
-        for row in table.rows
+        for r in range(len(table.rows))
     )
     note = f"<p class=note>{escape(table.note)}</p>\n" if table.note else ""
     return (
@@ -227,11 +228,11 @@ def _risks(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
     by_scenario = (figures or {}).get("by_scenario", {})
     register = from_figures(by_scenario, {}, provenance.get("suite_hash", ""))
     hazards, scenarios = register.tables()
-    parts = [
+    intro = (
         "<p>What the system does not or only partly answer. Field-blocking: more evidence is "
-        "needed before it runs unsupervised; monitor: data have to be collected in the field.</p>\n",
-        _table(hazards),
-    ]
+        "needed before it runs unsupervised; monitor: collect data in the field.</p>\n"
+    )
+    parts = [intro, _table(hazards)]
     if by_scenario:
         # The hazard classes are in the scenario files, which this page does not have.
         columns = [i for i, c in enumerate(scenarios.columns) if c != "Hazard"]
@@ -280,6 +281,9 @@ def _href(folder: Path, path: Path) -> str:
 
 
 def _is_number(cell: Cell) -> bool:
+    """Numbers, and texts that are written numbers: they stand on the right."""
+    if isinstance(cell, str):
+        return cell.replace(".", "", 1).removeprefix("-").isdecimal()
     return isinstance(cell, (int, float)) and not isinstance(cell, bool)
 
 
@@ -287,10 +291,13 @@ def _numberish(cell: Cell) -> bool:
     return cell is None or cell == "" or _is_number(cell)
 
 
-def _text(cell: Cell) -> str:
-    if cell is None:
-        return "–"
-    return f"{cell:g}" if isinstance(cell, float) else str(cell)
+def _column(cells: Sequence[Cell]) -> list[str]:
+    """The texts of a column: its fractions with equally many decimals, so that points align."""
+    shown = [f"{c:.6g}" for c in cells if isinstance(c, float)]
+    decimals = max((len(t.partition(".")[2]) for t in shown if "e" not in t), default=0)
+    return [
+        "–" if c is None else f"{c:.{decimals}f}" if isinstance(c, float) else str(c) for c in cells
+    ]
 
 
 def _write(path: Path, text: str) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from bikeped import __version__
 from bikeped.capture import FrameGrabber, FrameSource, Paced, open_source
 from bikeped.config import LoadedConfig
+from bikeped.config.provenance import check_provenance
 from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_driver, open_speaker
 from bikeped.service.announcer import Announcer
 from bikeped.service.feed import LiveFeed
@@ -61,6 +62,8 @@ async def _run(loaded: LoadedConfig, eye: Eye | None) -> int:
         loaded.source,
         loaded.calibration_hash or "none",
     )
+    provenance = check_provenance(loaded)
+    log.log(logging.INFO if provenance.holds else logging.WARNING, "%s", provenance.text)
     judge = Judge(loaded)
     light = light_driver(loaded.config.feedback)
     notifier = Notifier()
