@@ -53,6 +53,7 @@ def tracker_settings(tracking: TrackingConfig, nominal_fps: float = 30.0) -> Tra
         position_noise_m=tracking.position_noise_m,
         unbiased=True,
         max_range_m=tracking.max_range_m,
+        rider_radius_m=tracking.rider_radius_m,
     )
 
 

@@ -275,6 +275,15 @@ class TrackingConfig(_Section, frozen=True):
     confirm_hits: Annotated[
         int, Meta(ge=1, le=30, description="matches before a track counts as present")
     ] = 2
+    rider_radius_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=5,
+            description="a person without a track, this near to a cyclist's track without a "
+            "detection, is that cyclist, and the reverse; 0: never, m",
+        ),
+    ] = 1.0
     max_range_m: Annotated[
         float,
         Meta(gt=0, le=1000, description="nothing farther from the camera is tracked, m"),

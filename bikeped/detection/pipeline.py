@@ -17,6 +17,7 @@ import numpy.typing as npt
 from bikeped.detection.base import DetectorAnswer
 from bikeped.detection.classes import UNMAPPED, class_names, kind_table
 from bikeped.detection.facts import ModelMetadata
+from bikeped.detection.halves import drop_halves
 from bikeped.detection.layouts import Candidates, Layout, choose_layout, decode, pick_output
 from bikeped.detection.nms import suppress
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
@@ -178,7 +179,7 @@ class NetworkDetector:
         kind, score, box = kind[on_frame], score[on_frame], box[on_frame]
         keep = suppress(box, score, kind, self._config.iou, self._config.max_detections)
         joined = join_riders(
-            Detections(kind[keep], score[keep], box[keep]),
+            drop_halves(Detections(kind[keep], score[keep], box[keep])),
             self._config.rider_overlap,
             self._config.confidence,
         )

@@ -13,10 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.tracking.matching import IndexArray, match_greedy
-from bikeped.types import BoolArray, FloatArray, IntArray, KindArray
+from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
 
 #: Slack of comparisons between times, far below a frame and far above rounding.
 _EPSILON_S = 1e-6
+_PEDESTRIAN, _CYCLIST, _VEHICLE = (int(k) for k in (Kind.PEDESTRIAN, Kind.CYCLIST, Kind.VEHICLE))
+#: How a track's kind follows its detections (see `TrackerSettings.rider_radius_m`): the share of
+#: cycles among the recent ones, smoothed with this weight; two cycles in a row make a cyclist, 0.7
+#: to 2.3 s of mere persons a pedestrian again.
+_CYCLE_WEIGHT, _CYCLE_ON, _CYCLE_OFF = 0.08, 0.12, 0.03
+#: A cyclist unseen for longer is not a rider's any more.
+_RIDER_UNSEEN_S = 1.0
 #: A track that is not yet confirmed is dropped when unseen for longer than this.
 _TENTATIVE_S = 0.2
 
@@ -31,6 +38,11 @@ class TrackerSettings:
     track's last seen position. `velocity_weight` is the weight of the newest step per `frame_s`.
     With `unbiased` the smoothed velocity starts at the first step instead of at zero. A track that
     coasts farther than `max_range_m` from the origin is dropped.
+
+    `rider_radius_m`: detectors see a small bicycle in some frames and only its rider in others. A
+    person without a track, this near to a cyclist's track without a detection, is that cyclist (and
+    the reverse), so that one rider does not become a cyclist and a pedestrian who meet. 0: never,
+    as in the paper's simulation, whose agents have one kind.
     """
 
     match_radius_m: float = 3.0
@@ -42,6 +54,7 @@ class TrackerSettings:
     position_noise_m: float = math.inf
     unbiased: bool = False
     max_range_m: float = math.inf
+    rider_radius_m: float = 0.0
 
 
 class LaneTracker:
@@ -65,6 +78,7 @@ class LaneTracker:
         self.hits: IntArray = np.zeros((lanes, slots), np.int64)
         self.detection: IndexArray = np.full((lanes, slots), -1, np.intp)
         self._seen_xy_m: FloatArray = np.zeros((lanes, slots, 2))
+        self._cycle_share: FloatArray = np.zeros((lanes, slots))
         self._next_id: IntArray = np.ones(lanes, np.int64)
         self._max_speed = np.asarray(settings.max_speed_mps)
         self._gated = bool(np.isfinite(self._max_speed).any())
@@ -94,7 +108,7 @@ class LaneTracker:
         )
         matched, refused = self._match(xy_m, kind)
         self.detection = matched
-        self._correct(time_s, xy_m, matched)
+        self._correct(time_s, xy_m, kind, matched)
         self._drop(time_s)
         fresh = kind >= 0
         lane, slot = (matched >= 0).nonzero()
@@ -116,25 +130,54 @@ class LaneTracker:
         # Flat indices over all lanes: what follows runs over the few near pairs only.
         track = lane * slots + slot
         place = lane * detections + detection
+        near_cost = cost[lane, slot, detection]
         same = self.kind.ravel()[track] == kind.ravel()[place]
-        track, place, near_cost = track[same], place[same], cost[lane, slot, detection][same]
+        shape = (lanes * slots, lanes * detections)
         if not self._gated:
-            matched = match_greedy(track, place, near_cost, lanes * slots, lanes * detections)
+            matched = match_greedy(track[same], place[same], near_cost[same], *shape)
             return self._per_slot(matched, detections), None
         reach = (
             self._max_speed[self.kind.ravel()[track]] * (self.time_s - self.seen_s.ravel()[track])
             + self.settings.position_noise_m
         )
         way = xy_m.reshape(-1, 2)[place] - self._seen_xy_m.reshape(-1, 2)[track]
-        allowed = way[:, 0] ** 2 + way[:, 1] ** 2 <= reach**2
-        matched = match_greedy(
-            track[allowed], place[allowed], near_cost[allowed], lanes * slots, lanes * detections
-        )
+        allowed = same & (way[:, 0] ** 2 + way[:, 1] ** 2 <= reach**2)
+        matched = match_greedy(track[allowed], place[allowed], near_cost[allowed], *shape)
         # A gate may refuse a match but must not breed tracks: a detection beside a track that is
         # still free is that track's, too far for one frame; it waits until the gate has widened.
         refused = np.zeros(lanes * detections, np.bool_)
-        refused[place[~allowed & (matched[track] < 0)]] = True
+        refused[place[same & ~allowed & (matched[track] < 0)]] = True
+        if self.settings.rider_radius_m > 0 and np.count_nonzero(same) < len(same):
+            self._match_riders(track, place, near_cost, kind, matched, refused)
         return self._per_slot(matched, detections), refused.reshape(lanes, detections)
+
+    def _match_riders(
+        self,
+        track: IndexArray,
+        place: IndexArray,
+        cost: FloatArray,
+        kind: KindArray,
+        matched: IndexArray,
+        refused: BoolArray,
+    ) -> None:
+        """Second choice: a free pedestrian beside a free cyclist's track is its rider, and the
+        reverse. Fills in `matched`; what kind the track is, `_correct` decides."""
+        taken = np.zeros(len(refused), np.bool_)
+        taken[matched[matched >= 0]] = True
+        track_kind, detected_kind = self.kind.ravel()[track], kind.ravel()[place]
+        fit = (
+            (track_kind != detected_kind)
+            & (track_kind != _VEHICLE)
+            & (detected_kind != _VEHICLE)
+            & (cost <= self.settings.rider_radius_m**2)
+            & (matched[track] < 0)
+            & ~taken[place]
+            & ~refused[place]
+            & (self.time_s - self.seen_s.ravel()[track] <= _RIDER_UNSEEN_S)
+        )
+        riders = match_greedy(track[fit], place[fit], cost[fit], len(matched), len(refused))
+        found = riders >= 0
+        matched[found] = riders[found]
 
     def _per_slot(self, matched: IndexArray, detections: int) -> IndexArray:
         """[lanes, slots] index within the lane, from the flat index over all lanes."""
@@ -143,7 +186,9 @@ class LaneTracker:
             return shaped
         return np.where(shaped >= 0, shaped - np.arange(len(shaped))[:, None] * detections, -1)
 
-    def _correct(self, time_s: float, xy_m: FloatArray, matched: IndexArray) -> None:
+    def _correct(
+        self, time_s: float, xy_m: FloatArray, kind: KindArray, matched: IndexArray
+    ) -> None:
         # Views over all lanes with one flat index: half the time of indexing lane and slot.
         flat = (matched.ravel() >= 0).nonzero()[0]
         if len(flat) == 0:
@@ -153,7 +198,8 @@ class LaneTracker:
         acceleration = self.acceleration_mps2.reshape(-1, 2)
         seen_xy = self._seen_xy_m.reshape(-1, 2)
         seen_s, hits = self.seen_s.reshape(-1), self.hits.reshape(-1)
-        new_xy = xy_m.reshape(-1, 2)[lane * xy_m.shape[1] + matched.ravel()[flat]]
+        place = lane * xy_m.shape[1] + matched.ravel()[flat]
+        new_xy = xy_m.reshape(-1, 2)[place]
         elapsed = np.maximum(time_s - seen_s[flat], _EPSILON_S)
         keep = (1 - self.settings.velocity_weight) ** (elapsed / self.settings.frame_s)
         old_v, old_a = velocity[flat], acceleration[flat]
@@ -173,6 +219,18 @@ class LaneTracker:
         seen_xy[flat] = new_xy
         seen_s[flat] = time_s
         hits[flat] += 1
+        if self.settings.rider_radius_m > 0:
+            self._settle_kind(flat, kind.ravel()[place])
+
+    def _settle_kind(self, flat: IndexArray, seen: KindArray) -> None:
+        """Lets the kind of pedestrians and cyclists follow what they were lately seen as."""
+        share, kind = self._cycle_share.reshape(-1), self.kind.reshape(-1)
+        share[flat] += _CYCLE_WEIGHT * ((seen == _CYCLIST) - share[flat])
+        was = kind[flat]
+        kind[flat] = np.where((was == _PEDESTRIAN) & (share[flat] > _CYCLE_ON), _CYCLIST, was)
+        kind[flat] = np.where(
+            (was == _CYCLIST) & (share[flat] < _CYCLE_OFF), _PEDESTRIAN, kind[flat]
+        )
 
     def _drop(self, time_s: float) -> None:
         unseen = time_s - self.seen_s
@@ -202,6 +260,7 @@ class LaneTracker:
         self.acceleration_mps2[at] = 0.0
         self.seen_s[at] = time_s
         self.hits[at] = 1
+        self._cycle_share[at] = kind[lane, detection] == _CYCLIST
         self.detection[at] = detection
 
     def _grow(self) -> None:
@@ -220,6 +279,7 @@ class LaneTracker:
         self.seen_s = wider(self.seen_s)
         self.hits = wider(self.hits)
         self._seen_xy_m = wider(self._seen_xy_m)
+        self._cycle_share = wider(self._cycle_share)
         self.detection = np.concatenate(
             [self.detection, np.full((lanes, slots), -1, np.intp)], axis=1
         )

@@ -1,0 +1,57 @@
+"""Two boxes of one person: the whole, and head and shoulders alone.
+
+Detectors answer a person whose legs are hard to see with both. They overlap by about a half, which
+suppression lets pass, and the upper one ends where no feet are: on the ground it would be a second
+pedestrian, metres behind the first and closing in with it on whatever comes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bikeped.types import BoolArray, Detections, Kind
+
+# The half lies by this share of its area within the whole,
+_WITHIN = 0.85
+# starts within this share of the whole's height from its top (a child before an adult: lower),
+_TOP = 0.2
+# ends above this share of it (else suppression is the judge),
+_HEIGHT = 0.8
+# and is at least this share as wide (a narrow person within a group's box is a person).
+_WIDTH = 0.5
+
+
+def drop_halves(found: Detections) -> Detections:
+    """The detections without pedestrians that are another's upper half; order is kept.
+
+    The whole takes the greater confidence of the two.
+    """
+    person = np.nonzero(found.kind == Kind.PEDESTRIAN)[0]
+    if len(person) < 2:
+        return found
+    half = _is_half(found.box_px[person].astype(np.float64))
+    if not half.any():
+        return found
+    score = found.confidence.copy()
+    own = found.confidence[person]
+    best = np.where(half, own[:, None], 0).max(axis=0)
+    score[person] = np.maximum(own, best)
+    left = np.setdiff1d(np.arange(len(found)), person[half.any(axis=1)])
+    order = left[np.argsort(-score[left], kind="stable")]
+    return Detections(found.kind[order], score[order], found.box_px[order])
+
+
+def _is_half(box: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> BoolArray:
+    """[n, n]: whether the row's box is the upper half of the column's."""
+    small, large = box[:, None, :], box[None, :, :]
+    wide = np.minimum(small[..., 2], large[..., 2]) - np.maximum(small[..., 0], large[..., 0])
+    high = np.minimum(small[..., 3], large[..., 3]) - np.maximum(small[..., 1], large[..., 1])
+    small_wide, small_high = small[..., 2] - small[..., 0], small[..., 3] - small[..., 1]
+    large_wide, large_high = large[..., 2] - large[..., 0], large[..., 3] - large[..., 1]
+    shared = np.maximum(wide, 0) * np.maximum(high, 0)
+    return np.asarray(
+        (shared >= _WITHIN * small_wide * small_high)
+        & (np.abs(small[..., 1] - large[..., 1]) <= _TOP * large_high)
+        & (small_high < _HEIGHT * large_high)
+        & (small_wide >= _WIDTH * large_wide)
+    )

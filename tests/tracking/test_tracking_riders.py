@@ -1,0 +1,83 @@
+"""A detector that sees a small bicycle only now and then: one rider, one track, one kind."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bikeped.tracking import LaneTracker, TrackerSettings
+from bikeped.types import Kind
+
+P, C, V = int(Kind.PEDESTRIAN), int(Kind.CYCLIST), int(Kind.VEHICLE)
+SETTINGS = TrackerSettings(
+    max_unseen_s=10.0,
+    confirm_hits=2,
+    max_speed_mps=(6.0, 20.0, 40.0),
+    position_noise_m=0.75,
+    unbiased=True,
+    rider_radius_m=1.0,
+)
+
+
+def feed(tracker: LaneTracker, frame: int, *detections: tuple[int, float, float]) -> None:
+    xy = np.asarray([[x, y] for _, x, y in detections]).reshape(1, -1, 2)
+    kind = np.asarray([[k for k, _, _ in detections]], np.int8).reshape(1, -1)
+    tracker.update(frame / 30, xy, kind)
+
+
+def kinds(tracker: LaneTracker) -> dict[int, int]:
+    alive = tracker.alive[0]
+    return dict(zip(tracker.id[0][alive].tolist(), tracker.kind[0][alive].tolist(), strict=True))
+
+
+def test_a_flickering_rider_stays_one_cyclist():
+    tracker = LaneTracker(SETTINGS)
+    rng = np.random.default_rng(3)
+    for frame in range(120):
+        cycle_seen = frame < 3 or rng.random() < 0.4
+        feed(tracker, frame, (C if cycle_seen else P, 4.0 * frame / 30, 5.0))
+        assert kinds(tracker) == {1: C}
+
+
+def test_a_rider_first_taken_for_a_walker_becomes_a_cyclist_without_leaving_a_ghost():
+    tracker = LaneTracker(SETTINGS)
+    for frame in range(20):
+        feed(tracker, frame, (P if frame < 10 else C, 4.0 * frame / 30, 5.0))
+    assert kinds(tracker) == {1: C}
+
+
+def test_one_false_bicycle_does_not_make_a_walker_a_cyclist():
+    tracker = LaneTracker(SETTINGS)
+    for frame in range(60):
+        feed(tracker, frame, (C if frame == 30 else P, 1.3 * frame / 30, 5.0))
+        assert kinds(tracker) == {1: P}
+
+
+def test_who_gets_off_and_walks_is_a_pedestrian_again():
+    tracker = LaneTracker(SETTINGS)
+    for frame in range(30 + 90):
+        feed(tracker, frame, (C if frame < 30 else P, 1.3 * frame / 30, 5.0))
+    assert kinds(tracker) == {1: P}
+
+
+def test_a_pedestrian_beside_a_cyclist_who_is_seen_keeps_a_track_of_their_own():
+    tracker = LaneTracker(SETTINGS)
+    for frame in range(30):
+        feed(tracker, frame, (C, 0.0, 5.0), (P, 0.6, 5.0))
+    assert sorted(kinds(tracker).values()) == [P, C]
+
+
+def test_a_person_farther_than_a_rider_can_be_is_new():
+    tracker = LaneTracker(SETTINGS)
+    for frame in range(5):
+        feed(tracker, frame, (C, 0.0, 5.0))
+    feed(tracker, 5, (P, 1.5, 5.0))
+    assert kinds(tracker) == {1: C, 2: P}
+
+
+def test_vehicles_and_the_simulation_are_left_alone():
+    for settings, first, then in ((SETTINGS, V, P), (TrackerSettings(), C, P)):
+        tracker = LaneTracker(settings)
+        for frame in range(5):
+            feed(tracker, frame, (first, 0.0, 5.0))
+        feed(tracker, 5, (then, 0.2, 5.0))
+        assert kinds(tracker) == {1: first, 2: then}
