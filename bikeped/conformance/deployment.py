@@ -123,7 +123,7 @@ def _measured(
         for camera, where in views
     ]
     found = simulate_views(observed, truth, Plan(recall, None), {"": decision}, range(trials), seed)
-    told = [summaries(part[0][""]) for part in found]
+    told = [summaries(part[0, 0][""]) for part in found]
     return list(zip(told[: len(views)], told[len(views) :], strict=True))
 
 

@@ -80,8 +80,11 @@ def one_scenario(suite: Suite, name: str) -> Suite:
     """The suite with only the scenario of this name (upper and lower case are alike)."""
     found = [s for s in suite.scenarios if s.name.casefold() == name.strip().casefold()]
     if not found:
-        near = difflib.get_close_matches(name, suite.names, 1)
-        mend = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(suite.names)}"
+        known = {n.casefold(): n for n in suite.names}
+        near = difflib.get_close_matches(name.casefold(), known, 1, 0.4)
+        mend = (
+            f"did you mean {known[near[0]]!r}?" if near else f"known are {', '.join(suite.names)}"
+        )
         raise ScenarioError(f"--scenario {name!r}: there is no such scenario; {mend}")
     return replace(suite, scenarios=tuple(found))
 
@@ -114,16 +117,15 @@ def run_table(suite: Suite, decision: DecisionConfig) -> Result:
         "Scenarios",
         (
             "scenario",
-            "hazard",
             "expected",
             "dominant",
             "danger",
             "actionable",
-            "sensitivity, %",
-            "specificity, %",
+            "sens, %",
+            "spec, %",
             "SevFN, %",
             "fatigue, %",
-            "latency, s",
+            "late, s",
             "mean budget, s",
             "min budget, s",
             "lead, s",
@@ -131,7 +133,6 @@ def run_table(suite: Suite, decision: DecisionConfig) -> Result:
         [
             (
                 row["scenario"],
-                row["hazard"],
                 row["expected"],
                 row["dominant"],
                 row["danger_frames"],
@@ -147,8 +148,8 @@ def run_table(suite: Suite, decision: DecisionConfig) -> Result:
             )
             for row in rows
         ],
-        "latency: from the first actionable frame to ALERT; lead: from the first ALERT to the "
-        "closest approach",
+        "danger, actionable: frames; late: from the first actionable frame to ALERT; lead: from "
+        "the first ALERT to the closest approach",
     )
     total = Table("run_totals", "All scenarios", SHOWN_COLUMNS, [shown(totals)])
     return Result(

@@ -14,9 +14,9 @@ from bikeped.conformance.metrics import TruthFrames
 from bikeped.conformance.montecarlo import (
     TRIALS,
     Plan,
-    by_name,
     measure_lanes,
     run_plans,
+    sorted_suite,
     summaries,
 )
 from bikeped.conformance.perception import RecallModel
@@ -106,11 +106,14 @@ def sweep_with_loss(
 ) -> Result:
     """Latency and lost detections together; size-aware recall, independent losses by default."""
     model = recall or RecallModel("size")
-    plans = [Plan(model, burst, delay_frames(ms), tuple(PREDICTORS.values())) for ms in delays_ms]
-    found = run_plans(by_name(suite), plans, {"": decision}, trials, seed, processes, progress)
+    cases = [(delay_frames(ms), order) for ms in delays_ms for order in PREDICTORS.values()]
+    plan = Plan(model, burst, tuple(dict.fromkeys(cases)))
+    found = run_plans(
+        sorted_suite(suite), [plan], {"": decision}, trials, seed, processes, progress
+    )[0]
     predictors: dict[str, Any] = {}
     for name, order in PREDICTORS.items():
-        by_delay = [summaries(part[order][""]) for part in found]
+        by_delay = [summaries(found[delay_frames(ms), order][""]) for ms in delays_ms]
         predictors[name] = {
             figure: {
                 key: [row[figure][key] for row in by_delay]

@@ -25,7 +25,7 @@ from bikeped.config import DecisionConfig, rule_settings
 from bikeped.conformance.experiments import Progress, percent, quiet
 from bikeped.conformance.metrics import Metrics, TruthFrames, measure
 from bikeped.conformance.perception import RecallMode, RecallModel, Seen, lost, trial_generator
-from bikeped.conformance.simulate import Scene, Tracked, rows_of, states, track
+from bikeped.conformance.simulate import Scene, Tracked, delayed, rows_of, states, track
 from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.tables import Result, Table
 from bikeped.errors import BikepedError
@@ -33,9 +33,9 @@ from bikeped.types import BoolArray, FloatArray, KindArray
 
 TRIALS = 50
 BURST_FRAMES = 5.0
-#: Bytes that the tracker's history of one chunk of lanes may take; some three times as much is in
-#: use while it is stacked and turned into rows.
-CHUNK_BYTES = 150_000_000
+#: Bytes that the tracker's history of one chunk of lanes may take (some three times as much is in
+#: use while it is turned into rows). Larger chunks are slower: they leave the cache.
+CHUNK_BYTES = 60_000_000
 #: Reported, id, kind, and three vectors, of one slot in one frame.
 _SLOT_BYTES = 1 + 8 + 1 + 3 * 16
 #: Environment that keeps each worker process on one core.
@@ -46,6 +46,8 @@ _ONE_THREAD = (
     "VECLIB_MAXIMUM_THREADS",
 )
 
+#: Delay in frames, order of the predictor.
+Case = tuple[int, int]
 #: Figures by trial: configuration's name to the metrics of each trial.
 TrialMetrics = dict[str, list[Metrics]]
 
@@ -68,28 +70,25 @@ class Observed:
         rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
         return Observed(name, seen.observed_m, rate, seen.present, seen.kind)
 
-    def trials(
-        self, trials: Sequence[int], seed: int, burst: float | None, delay_frames: int = 0
-    ) -> list[Scene]:
+    def trials(self, trials: Sequence[int], seed: int, burst: float | None) -> list[Scene]:
         """The detections of each trial."""
         draw = np.stack(
             [trial_generator(seed, self.name, t).random(self.recall.shape) for t in trials], axis=1
         )
         missed = lost(draw, self.recall[:, None], self.present[:, None], burst)
         return [
-            Scene(self.xy_m, self.present & ~missed[:, i], self.kind, delay_frames)
-            for i in range(len(trials))
+            Scene(self.xy_m, self.present & ~missed[:, i], self.kind) for i in range(len(trials))
         ]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """One way of losing detections; `orders` are the predictors that are asked (0: none)."""
+    """One way of losing detections; `cases` are the delays in frames and the predictors' orders
+    (0: none) under which the same losses are looked at."""
 
     recall: RecallModel
     burst: float | None
-    delay_frames: int = 0
-    orders: tuple[int, ...] = (0,)
+    cases: tuple[Case, ...] = ((0, 0),)
 
 
 def simulate_trials(
@@ -99,8 +98,8 @@ def simulate_trials(
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
-) -> dict[int, TrialMetrics]:
-    """Metrics of every trial by predictor order and configuration; `truth` joins the scenarios of
+) -> dict[Case, TrialMetrics]:
+    """Metrics of every trial by case and configuration; `truth` joins the scenarios of
     `observed` in their order."""
     return simulate_views([observed], truth, plan, configurations, trials, seed)[0]
 
@@ -112,29 +111,34 @@ def simulate_views(
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
-) -> list[dict[int, TrialMetrics]]:
+) -> list[dict[Case, TrialMetrics]]:
     """The same of several views of the same scenarios (other cameras), in the same trackers."""
     every = [o for view in views for o in view]
     frames = max(len(o.xy_m) for o in every)
     slots = max(2 * max(o.xy_m.shape[1] for o in every), 4)
     size = max(1, CHUNK_BYTES // (truth.count * frames * slots * _SLOT_BYTES))
     units = [(view, trial) for view in range(len(views)) for trial in trials]
-    found: list[dict[int, TrialMetrics]] = [
-        {order: {name: [] for name in configurations} for order in plan.orders} for _ in views
+    found: list[dict[Case, TrialMetrics]] = [
+        {case: {name: [] for name in configurations} for case in plan.cases} for _ in views
     ]
     for begin in range(0, len(units), size):
         part = units[begin : begin + size]
         scenes: list[Scene] = []
         for view in dict.fromkeys(v for v, _ in part):
             mine = [trial for v, trial in part if v == view]
-            by_scenario = [o.trials(mine, seed, plan.burst, plan.delay_frames) for o in views[view]]
+            by_scenario = [o.trials(mine, seed, plan.burst) for o in views[view]]
             # Trial after trial, and in each the scenarios in their order: as `truth` has them.
             scenes += [lanes[i] for i in range(len(mine)) for lanes in by_scenario]
         tracked = track(scenes)
-        for order in plan.orders:
-            for name, metrics in measure_lanes(tracked, order, truth, configurations).items():
-                for (view, _), one in zip(part, metrics, strict=True):
-                    found[view][order][name].append(one)
+        for delay in dict.fromkeys(delay for delay, _ in plan.cases):
+            late = delayed(tracked, delay)
+            for case in plan.cases:
+                if case[0] != delay:
+                    continue
+                by_name = measure_lanes(late, case[1], truth, configurations)
+                for name, metrics in by_name.items():
+                    for (view, _), one in zip(part, metrics, strict=True):
+                        found[view][case][name].append(one)
     return found
 
 
@@ -153,7 +157,7 @@ def measure_lanes(
     }
 
 
-def by_name(suite: Suite) -> Suite:
+def sorted_suite(suite: Suite) -> Suite:
     """The suite in order of names: sums of floats depend on their order, results must not."""
     return replace(suite, scenarios=tuple(sorted(suite.scenarios, key=lambda s: s.name)))
 
@@ -179,7 +183,7 @@ def plan_trials(
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
-) -> dict[int, TrialMetrics]:
+) -> dict[Case, TrialMetrics]:
     """`simulate_trials` of a suite (in order of names), one job of a process."""
     observed = [
         Observed.of(s.name, seen, plan.recall)
@@ -196,11 +200,11 @@ def run_plans(
     seed: int,
     processes: int = 1,
     progress: Progress = quiet,
-) -> list[dict[int, TrialMetrics]]:
+) -> list[dict[Case, TrialMetrics]]:
     """All plans over all trials; `suite` in order of names. Progress counts `plan_jobs`."""
-    parts = [range(trials)[i::processes] for i in range(min(processes, trials))]
+    parts = [range(trials)[i :: _parts(trials)] for i in range(_parts(trials))]
     jobs = [(i, part) for i in range(len(plans)) for part in parts]
-    done: dict[tuple[int, int], dict[int, TrialMetrics]] = {}
+    done: dict[tuple[int, int], dict[Case, TrialMetrics]] = {}
     with contextlib.ExitStack() as stack:
         executor: Executor | None = None
         if processes > 1 and len(jobs) > 1:
@@ -219,21 +223,26 @@ def run_plans(
                 progress(count + 1)
     merged = []
     for i, plan in enumerate(plans):
-        whole: dict[int, TrialMetrics] = {}
-        for order in plan.orders:
-            whole[order] = {}
+        whole: dict[Case, TrialMetrics] = {}
+        for case in plan.cases:
+            whole[case] = {}
             for name in configurations:
                 row: list[Metrics | None] = [None] * trials
                 for part in parts:
-                    row[part.start :: len(parts)] = done[i, part.start][order][name]
-                whole[order][name] = [m for m in row if m is not None]
+                    row[part.start :: len(parts)] = done[i, part.start][case][name]
+                whole[case][name] = [m for m in row if m is not None]
         merged.append(whole)
     return merged
 
 
-def plan_jobs(plans: int, trials: int, processes: int) -> int:
+def plan_jobs(plans: int, trials: int) -> int:
     """How far the progress of `run_plans` counts."""
-    return plans * min(processes, trials)
+    return plans * _parts(trials)
+
+
+def _parts(trials: int) -> int:
+    """Into how many jobs the trials are cut: enough for a bar to move and for cores to share."""
+    return min(trials, max(8, trials // 50))
 
 
 def summary(values: Iterable[float]) -> dict[str, float | int | None]:
@@ -299,20 +308,20 @@ def montecarlo(
 
     `by_scenario` tells the first configuration, independent losses, the finest recall given.
     """
-    ordered = by_name(suite)
+    ordered = sorted_suite(suite)
     models = recall_models(curve)
     cases = [(loss, model) for loss in ("independent", "burst") for model in models]
     plans = [Plan(model, burst if loss == "burst" else None) for loss, model in cases]
     found = run_plans(ordered, plans, configurations, trials, seed, processes, progress)
     rows: list[dict[str, Any]] = []
     for (loss, model), part in zip(cases, found, strict=True):
-        for name, metrics in part[0].items():
+        for name, metrics in part[0, 0].items():
             case = {"loss": loss, "recall": model.mode, "configuration": name}
             rows.append({**case, "metrics": summaries(metrics)})
     detailed = len(models) - 1
     first = next(iter(configurations))
     by_scenario = {
-        name: scenario_summaries(found[detailed][0][first], ordered.names.index(name))
+        name: scenario_summaries(found[detailed][0, 0][first], ordered.names.index(name))
         for name in suite.names
     }
     data = {
@@ -332,9 +341,9 @@ def montecarlo(
     return Result("montecarlo", data, tuple(_tables(data, burst, trials)))
 
 
-def montecarlo_jobs(trials: int, processes: int, curve: bool) -> int:
+def montecarlo_jobs(trials: int, curve: bool) -> int:
     """How far the progress of `montecarlo` counts."""
-    return plan_jobs(6 if curve else 4, trials, processes)
+    return plan_jobs(6 if curve else 4, trials)
 
 
 def _tables(data: Mapping[str, Any], burst: float, trials: int) -> Iterator[Table]:

@@ -7,7 +7,7 @@ frames in the same tracker; what comes out are track rows, on which the rules ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,32 +79,72 @@ def track(scenes: Sequence[Scene], settings: TrackerSettings = SIMULATION_TRACKE
         xy[late : late + count, lane, :width] = np.where(there[..., None], scene.xy_m[:count], 0.0)
         kind[late : late + count, lane, :width] = np.where(there, scene.kind, -1)
     tracker = LaneTracker(settings, lanes, slots=max(2 * agents, 4))
-    steps = []
+    history = _history(longest, tracker)
     for frame in range(longest):
         tracker.update(frame / FPS, xy[frame], kind[frame])
-        steps.append(
-            (
-                tracker.reported,
-                tracker.id.copy(),
-                tracker.kind.copy(),
-                tracker.xy_m.copy(),
-                tracker.velocity_mps.copy(),
-                tracker.acceleration_mps2.copy(),
-            )
-        )
-    slots = tracker.alive.shape[1]
-    stacked = [np.stack([_wide(step[i], slots) for step in steps]) for i in range(6)]
+        if tracker.alive.shape[1] > history[0].shape[2]:
+            old, history = history, _history(longest, tracker)
+            for wide, narrow in zip(history, old, strict=True):
+                wide[:, :, : narrow.shape[2]] = narrow
+        for array, now in zip(history, _arrays(tracker), strict=True):
+            array[frame] = now
     inside = np.arange(longest)[:, None] < frames[None, :]
+    reported, number, kinds, position, velocity, acceleration = history
     return Tracked(
-        reported=stacked[0] & inside[..., None],
-        id=stacked[1],
-        kind=stacked[2],
-        xy_m=stacked[3],
-        velocity_mps=stacked[4],
-        acceleration_mps2=stacked[5],
+        reported=reported & inside[..., None],
+        id=number,
+        kind=kinds,
+        xy_m=position,
+        velocity_mps=velocity,
+        acceleration_mps2=acceleration,
         frames=frames,
         delay_frames=np.asarray([s.delay_frames for s in scenes]),
     )
+
+
+def delayed(tracked: Tracked, frames: int) -> Tracked:
+    """What the tracker reports when the same detections come `frames` frames later.
+
+    A tracker knows time differences only, so its report is the same, later; nothing until then.
+    """
+    if frames == 0:
+        return tracked
+    longest = len(tracked.reported)
+    late = min(frames, longest)
+
+    def later(array: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        out = np.zeros_like(array)
+        out[late:] = array[: longest - late]
+        return out
+
+    inside = np.arange(longest)[:, None] < tracked.frames[None, :]
+    return replace(
+        tracked,
+        reported=later(tracked.reported) & inside[..., None],
+        id=later(tracked.id),
+        kind=later(tracked.kind),
+        xy_m=later(tracked.xy_m),
+        velocity_mps=later(tracked.velocity_mps),
+        acceleration_mps2=later(tracked.acceleration_mps2),
+        delay_frames=tracked.delay_frames + frames,
+    )
+
+
+def _arrays(tracker: LaneTracker) -> tuple[np.ndarray, ...]:  # type: ignore[type-arg]
+    """What is kept of every frame, in the order of `Tracked`."""
+    return (
+        tracker.reported,
+        tracker.id,
+        tracker.kind,
+        tracker.xy_m,
+        tracker.velocity_mps,
+        tracker.acceleration_mps2,
+    )
+
+
+def _history(frames: int, tracker: LaneTracker) -> list[np.ndarray]:  # type: ignore[type-arg]
+    """Room for every frame; made again, wider, when the tracker's slots have grown."""
+    return [np.zeros((frames, *a.shape), a.dtype) for a in _arrays(tracker)]
 
 
 @dataclass(frozen=True)
@@ -181,11 +221,3 @@ def states(run: Run, settings: RuleSettings) -> np.ndarray[tuple[int, ...], np.d
     approaching = frames_with(run.rows.frame[run.pairs.pedestrian_row[fired]], len(run.time_s))
     memory = remembered(run.time_s, run.cyclist_last_s, settings.memory_s)
     return resolve(run.pedestrian, memory, approaching)
-
-
-def _wide(array: np.ndarray, slots: int) -> np.ndarray:  # type: ignore[type-arg]
-    """Pads the slots axis, which may have grown during the run."""
-    missing = slots - array.shape[1]
-    if not missing:
-        return array
-    return np.pad(array, [(0, 0), (0, missing)] + [(0, 0)] * (array.ndim - 2))

@@ -1,0 +1,335 @@
+"""All experiments in all cores, with every table and figure, resumed after an interruption.
+
+Each experiment is one job; the longest start first. A finished one is written whole to
+`data/<name>.json` with a key made of everything it depends on (scenarios, configuration, code,
+parameters) and is taken from there when the key is the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, as_completed
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bikeped.config import LoadedConfig
+from bikeped.conformance import deployment, experiments, latency, montecarlo, optimizer
+from bikeped.conformance.experiments import Progress, provenance, quiet
+from bikeped.conformance.perception import RecallModel
+from bikeped.conformance.suite import CONFIGURATIONS, Suite
+from bikeped.conformance.tables import Result, Table
+from bikeped.errors import BikepedError
+
+#: Packages whose source decides what an experiment gives.
+_CODE = ("conformance", "decision", "geometry", "tracking", "config")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a reproduction may vary."""
+
+    trials: int = montecarlo.TRIALS
+    seed: int = 0
+    burst: float = montecarlo.BURST_FRAMES
+    curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    maxiter: int = optimizer.MAXITER
+    popsize: int = optimizer.POPSIZE
+    deployment_trials: int = deployment.DEPLOYMENT_TRIALS
+    placement_trials: int = deployment.PLACEMENT_TRIALS
+
+    @property
+    def recall(self) -> RecallModel:
+        """The finest recall model there is."""
+        return montecarlo.recall_models(self.curve)[-1]
+
+
+Experiment = Callable[[Suite, LoadedConfig, Settings], Result]
+
+
+def _montecarlo(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return montecarlo.montecarlo(suite, CONFIGURATIONS, s.trials, s.seed, s.burst, s.curve)
+
+
+def _latency_loss(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return latency.sweep_with_loss(
+        suite, loaded.config.decision, recall=s.recall, trials=s.trials, seed=s.seed
+    )
+
+
+def _optimize(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return optimizer.optimize(suite, loaded.config.decision, maxiter=s.maxiter, popsize=s.popsize)
+
+
+def _deployment(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    decision = loaded.config.decision
+    return deployment.deployment(suite.camera, decision, s.deployment_trials, s.seed, s.recall)
+
+
+def _placement(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    decision = loaded.config.decision
+    return deployment.placement(suite.camera, decision, s.placement_trials, s.seed, s.recall)
+
+
+def _latency(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return latency.sweep(suite, loaded.config.decision)
+
+
+def _truth(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return experiments.truth_sensitivity(suite, loaded.config.decision)
+
+
+def _braking(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return experiments.braking_profiles(suite, loaded.config.decision)
+
+
+def _run(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return experiments.run_table(suite, loaded.config.decision)
+
+
+def _budgets(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return experiments.warning_budgets(suite, loaded.config.decision)
+
+
+def _compare(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return experiments.compare_table(suite, loaded, seed=s.seed)
+
+
+def _errors(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+    return experiments.errors(suite)
+
+
+#: The longest first, so that no core waits long at the end.
+EXPERIMENTS: dict[str, Experiment] = {
+    "montecarlo": _montecarlo,
+    "optimize": _optimize,
+    "latency_loss": _latency_loss,
+    "deployment": _deployment,
+    "placement": _placement,
+    "latency": _latency,
+    "truth": _truth,
+    "braking": _braking,
+    "run": _run,
+    "compare": _compare,
+    "budgets": _budgets,
+    "errors": _errors,
+}
+#: The order of the index page.
+SHOWN_ORDER = (
+    "run",
+    "compare",
+    "budgets",
+    "errors",
+    "truth",
+    "braking",
+    "latency",
+    "montecarlo",
+    "latency_loss",
+    "deployment",
+    "placement",
+    "optimize",
+)
+
+
+@cache
+def code_version() -> str:
+    """SHA-256 over the sources that decide a result."""
+    package = Path(__file__).parent.parent
+    files = [package / "types.py"]
+    for name in _CODE:
+        files += (package / name).glob("*.py")
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        digest.update(f"{file.relative_to(package).as_posix()}\0".encode())
+        digest.update(file.read_bytes())
+    digest.update(np.__version__.encode())
+    return digest.hexdigest()
+
+
+def key_of(name: str, suite: Suite, loaded: LoadedConfig, settings: Settings) -> str:
+    """Everything that the result of an experiment depends on, as one hash.
+
+    The order of the scenarios counts too: tables and sums follow it.
+    """
+    parts = [
+        name,
+        code_version(),
+        suite.hash,
+        list(suite.names),
+        [scenario.hazard for scenario in suite.scenarios],
+        repr(suite.pose),
+        repr(suite.truth_settings),
+        loaded.hash,
+        repr(settings),
+    ]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def compute(
+    name: str, suite: Suite, loaded: LoadedConfig, settings: Settings
+) -> tuple[Result, float]:
+    """One experiment and the seconds it took: the job of a process."""
+    begin = time.perf_counter()
+    result = EXPERIMENTS[name](suite, loaded, settings)
+    return result, time.perf_counter() - begin
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What a run left: results in the order of the page, those reused, files, seconds."""
+
+    results: tuple[Result, ...]
+    reused: tuple[str, ...]
+    seconds: Mapping[str, float]
+    figures: tuple[Path, ...]
+    index: Path | None
+
+
+def reproduce(
+    suite: Suite,
+    loaded: LoadedConfig,
+    folder: Path,
+    settings: Settings = Settings(),
+    processes: int = 1,
+    figures: bool = True,
+    progress: Progress = quiet,
+) -> Reproduction:
+    """Runs every experiment that is not there yet, then writes tables, figures and the page.
+
+    Progress counts experiments, and the figures as one more.
+    """
+    data_folder, table_folder = folder / "data", folder / "tables"
+    for part in (data_folder, table_folder):
+        _make(part)
+    keys = {name: key_of(name, suite, loaded, settings) for name in EXPERIMENTS}
+    found: dict[str, Result] = {}
+    seconds: dict[str, float] = {}
+    for name, key in keys.items():
+        stored = read_stored(data_folder / f"{name}.json", key)
+        if stored is not None:
+            found[name] = stored
+    reused = tuple(found)
+    progress(len(found))
+    stamp = provenance(suite, loaded, settings.seed)
+
+    def keep(name: str, result: Result, took: float) -> None:
+        found[name], seconds[name] = result, took
+        document = {
+            "key": keys[name],
+            "provenance": stamp,
+            "seconds": took,
+            "data": result.data,
+            "tables": [_table_dict(table) for table in result.tables],
+        }
+        write_text(data_folder / f"{name}.json", _json(document))
+        progress(len(found))
+
+    _ = suite.truth_frames, suite.run  # made once, before the suite goes to every process
+    missing = [name for name in EXPERIMENTS if name not in found]
+    if processes > 1 and len(missing) > 1:
+        with montecarlo.pool(min(processes, len(missing))) as executor:
+            waiting: dict[Future[tuple[Result, float]], str] = {
+                executor.submit(compute, name, suite, loaded, settings): name for name in missing
+            }
+            for future in as_completed(waiting):
+                keep(waiting[future], *future.result())
+    else:
+        for name in missing:
+            keep(name, *compute(name, suite, loaded, settings))
+
+    results = tuple(found[name] for name in SHOWN_ORDER)
+    for result in results:
+        for table in result.tables:
+            write_text(table_folder / f"{table.name}.csv", table.csv())
+            write_text(table_folder / f"{table.name}.json", _json(_table_dict(table)))
+    drawn: tuple[Path, ...] = ()
+    index: Path | None = None
+    if figures:
+        from bikeped.conformance.figures import draw_all
+        from bikeped.conformance.report import write_index
+
+        drawn = tuple(draw_all({r.name: r.data for r in results}, suite, folder / "figures"))
+        said = {
+            "version": str(stamp["version"]),
+            "scenarios": str(stamp["scenarios"]),
+            "suite": suite.hash,
+            "configuration": loaded.hash,
+            "calibration": loaded.calibration_hash or "none",
+            "code": code_version(),
+            "trials": str(settings.trials),
+            "seed": str(settings.seed),
+            "optimiser's seed": str(optimizer.SEED),
+        }
+        index = write_index(folder, list(results), list(drawn), said)
+    progress(len(EXPERIMENTS) + 1)
+    return Reproduction(results, reused, seconds, drawn, index)
+
+
+def read_stored(path: Path, key: str) -> Result | None:
+    """A finished experiment of this key; None when there is none, or it is of another key."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if document["key"] != key:
+            return None
+        tables = tuple(
+            Table(
+                t["name"],
+                t["title"],
+                tuple(t["columns"]),
+                [tuple(row) for row in t["rows"]],
+                t["note"],
+            )
+            for t in document["tables"]
+        )
+        return Result(path.stem, document["data"], tables)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # missing, cut off or written by hand: computed again
+
+
+def _table_dict(table: Table) -> dict[str, Any]:
+    return {
+        "name": table.name,
+        "title": table.title,
+        "columns": list(table.columns),
+        "rows": [list(row) for row in table.rows],
+        "note": table.note,
+    }
+
+
+def _json(document: Mapping[str, Any]) -> str:
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BikepedError(
+            f"{folder}: cannot be made ({error.strerror}); choose another --out"
+        ) from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file under a temporary name and renames it: whole or not at all."""
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            Path(name).chmod(0o644)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise BikepedError(
+            f"{path}: cannot be written ({error.strerror}); choose another --out"
+        ) from error
