@@ -331,7 +331,6 @@ def _reference(axes: Axes, key: str) -> None:
             (PEDESTRIAN_PRT_S, f"distracted {PEDESTRIAN_PRT_S:g} s"),
             (ATTENTIVE_PRT_S, f"attentive {ATTENTIVE_PRT_S:g} s"),
         ]
-        axes.set_ylim(0, None)
     elif key in ("sensitivity", "specificity"):
         gate = 100 * (SENSITIVITY_MIN if key == "sensitivity" else SPECIFICITY_MIN)
         lines = [(gate, f"gate {gate:g} %")]
@@ -347,3 +346,5 @@ def _reference(axes: Axes, key: str) -> None:
             va="bottom",
             color="#3d3d3d",
         )
+    if key == "mean_warning_budget_s":
+        axes.set_ylim(0, None)  # last, for it ends the automatic scale

@@ -101,6 +101,7 @@ class Sheet:
 
         self._context = mpl.rc_context({**mpl.rcParamsDefault, **_SETTINGS})
         self._context.__enter__()
+        height = max(height, 2.0)  # below, labels leave no room for the panels
         title_lines = textwrap.wrap(title, int(width * 11.2)) or [""]
         lines = textwrap.wrap(caption, int(width * 15.6))
         above = len(title_lines) * _TITLE_PT * 1.3 / 72 + _MARGIN_IN
