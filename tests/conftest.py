@@ -215,7 +215,8 @@ camera:
   height_m: 5.0
   pitch_deg: -35
 detection: {{model: {model}, providers: [cpu], threads: 1, rider_overlap: 1.0}}
-mqtt: {{health_interval_s: 0.2}}
+mqtt:
+  health_interval_s: 0.2
 """
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-
 import threading
 from collections.abc import Callable
 
@@ -54,7 +53,7 @@ class FakeFeed:
 
     def __init__(self, live: bool = True) -> None:
         self.live = live
-        self.queue: asyncio.Queue[Frame | None | Exception] = asyncio.Queue()
+        self.queue: asyncio.Queue[Frame | Exception | None] = asyncio.Queue()
         self.last_s: float | None = None
         self.trouble: str | None = None
         self.hang_s = 0.0

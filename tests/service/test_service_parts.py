@@ -145,10 +145,8 @@ async def test_a_live_feed_that_ended_says_so_and_one_that_broke_says_why(make_c
     grabber.start()
     feed = LiveFeed(grabber)
     await asyncio.wait_for(failed.wait(), PATIENCE_S)
-    while feed.error() is None:  # set by the thread right after the call above
-        await asyncio.sleep(0)
+    await feed.close()  # waits for the thread, which sets the error right after the call above
     assert feed.error() == "/dev/video7: no such camera"
-    await feed.close()
 
 
 VISION = Vision(FakeEye())

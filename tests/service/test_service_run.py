@@ -1,0 +1,293 @@
+"""`bikeped run` as systemd runs it: a real process with a real model, stopped by a signal."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
+PATIENCE_S = 40.0
+
+
+class Service:
+    """A `bikeped run` process, its log as it comes, and what it tells the service manager."""
+
+    def __init__(self, config: Path, *options: str, program: str | None = None) -> None:
+        name = f"@bikeped-test-{uuid.uuid4().hex}"
+        self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.manager.bind("\0" + name[1:])
+        self.manager.settimeout(PATIENCE_S)
+        start = (
+            [sys.executable, "-c", program]
+            if program
+            else [sys.executable, "-m", "bikeped.cli.main"]
+        )
+        self.process = subprocess.Popen(
+            [*start, "run", "-c", str(config), *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "NOTIFY_SOCKET": name},
+        )
+        self.lines: list[str] = []
+        self._news = threading.Condition()
+        self._ended = False
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._news:
+                self.lines.append(line.rstrip())
+                self._news.notify()
+        with self._news:
+            self._ended = True
+            self._news.notify()
+
+    @property
+    def log(self) -> str:
+        return "\n".join(self.lines)
+
+    def until_said(self, pattern: str) -> re.Match[str]:
+        def found() -> re.Match[str] | None:
+            return re.search(pattern, self.log)
+
+        with self._news:
+            self._news.wait_for(lambda: found() or self._ended, PATIENCE_S)
+        match = found()
+        assert match, f"{pattern!r} was not said:\n{self.log}"
+        return match
+
+    def until_told(self, message: str) -> None:
+        while message not in self.manager.recv(4096).decode().split("\n"):
+            pass
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
+        return self.wait()
+
+    def wait(self) -> int:
+        status = self.process.wait(PATIENCE_S)
+        self._reader.join(PATIENCE_S)
+        return status
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._reader.join(PATIENCE_S)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self.manager.close()
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Service]]:
+    services: list[Service] = []
+
+    def begin(*arguments: object, **options: object) -> Service:
+        services.append(Service(*arguments, **options))  # type: ignore[arg-type]
+        return services[-1]
+
+    yield begin
+    for service in services:
+        service.close()
+
+
+def test_a_recording_in_the_cameras_place_ready_watched_and_stopped(start, make_clip, small_config):
+    service = start(small_config(make_clip("day.avi", 900)))
+    service.until_told("READY=1")
+    service.until_told("WATCHDOG=1")
+    service.until_said("SAFE: ")
+    service.until_said("simulated light: green")
+    service.until_said(r"health: .*latency p50/p95/p99 ms: acquire .*capture_age")
+    assert service.stop() == 0
+    service.until_told("STOPPING=1")
+    log = service.log
+    assert re.search(r"bikeped \d+\.\d+.*configuration [0-9a-f]{64} .*calibration none", log)
+    assert re.search(r"detector: pedestrian\.onnx .*sha256 [0-9a-f]{64}", log)
+    assert log.index("FAULT: ") < log.index("SAFE: ")
+    assert log.index("simulated light: orange") < log.index("simulated light: green")
+    assert re.search(r"latency\nstage, ms +mean +p50 +p95 +p99 +max\nacquire", log)
+    # Dark is the last that the light does, and the last that the service says.
+    assert "simulated light: off" in service.lines[-2]
+    assert "the light is off" in service.lines[-1]
+    assert log.rindex("simulated light: green") < log.rindex("simulated light: off")
+
+
+def test_the_end_of_a_rehearsal_is_a_clean_end(start, make_clip, small_config):
+    service = start(small_config(make_clip("short.avi", 15)))
+    assert service.wait() == 0
+    assert "the light is off" in service.lines[-1]
+
+
+def test_a_missing_camera_is_a_fault_and_not_the_end(start, small_config):
+    service = start(small_config("/dev/video-none"))
+    service.until_told("READY=1")
+    service.until_said("FAULT: camera: no frame yet.*no such camera; plug it in")
+    service.until_told("WATCHDOG=1")  # systemd has no reason to end it
+    assert service.process.poll() is None
+    assert service.stop(signal.SIGINT) == 0
+    assert "green" not in service.log
+    assert "blue" not in service.log
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["detection.model=/nowhere/model.onnx"], r"/nowhere/model\.onnx"),
+        (["detection.model=null"], r"small\.yaml.*detection\.model"),
+        (["feedback.light=gpio"], r"feedback\.gpio: no red lamp"),
+        (["camera.pad_size=100", "camera.crop_size=200"], r"camera\.crop_size"),
+        (["mqtt.enabled=true", "mqtt.password_file=/nowhere/pw"], r"mqtt\.password_file"),
+        (
+            ["feedback.sound.enabled=true", "feedback.sound.bell=/nowhere/b.wav"],
+            r"feedback\.sound\.bell",
+        ),
+    ],
+)
+def test_what_only_a_person_can_mend_ends_with_2_and_one_line(start, small_config, options, said):
+    service = start(small_config(), *[part for o in options for part in ("--set", o)])
+    assert service.wait() == 2
+    (line,) = [line for line in service.lines if line.startswith("bikeped: ")]
+    assert re.search(said, line)
+    assert "Traceback" not in service.log
+
+
+HANGS = """
+import sys, threading
+from bikeped.cli.main import main
+from bikeped.detection.base import DetectorAnswer
+from bikeped.types import Detections
+import bikeped.service.run as run
+
+class Eye:
+    name, model_hash, looks = "hangs", None, 0
+    def decode_size(self, width, height):
+        return width, height
+    def see(self, picture):
+        self.looks += 1
+        if self.looks > 20:
+            threading.Event().wait()  # for ever, as a driver may
+        return DetectorAnswer(Detections.empty(), 0.0, 0.0, 0.0)
+
+run.load_eye = lambda loaded: Eye()
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_hung_detector_is_a_fault_and_then_a_fresh_process(start, make_clip, small_config):
+    service = start(
+        small_config(make_clip("day.avi", 900)),
+        *("--set", "camera.hang_after_s=1.5"),
+        program=HANGS,
+    )
+    service.until_said("IDLE: ")
+    service.until_said("FAULT: detector: no answer for more than 0.5 s")
+    assert service.wait() == 75
+    assert "detector: has not returned for 1.5 s" in service.log
+    assert "the light is off" in service.lines[-1]
+
+
+LOADS_FOR_EVER = """
+import sys, threading
+from bikeped.cli.main import main
+import bikeped.service.run as run
+run.load_eye = lambda loaded: threading.Event().wait()
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_stopping_while_the_model_loads_is_prompt(start, small_config):
+    service = start(small_config(), program=LOADS_FOR_EVER)
+    service.until_told("STATUS=loading the model")
+    service.until_said("simulated light: orange")
+    assert service.stop() == 0
+    assert "the light is off" in service.lines[-1]
+
+
+def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp_path):
+    """A dead broker, a full disk, no USB light, no sound: the crossing is watched all the same."""
+    if shutil.disk_usage(tmp_path).free >= 1e12:
+        pytest.skip("this disk has more room than audit.min_free_mb can ask for")
+    config = small_config(
+        make_clip("day.avi", 900),
+        more="  enabled: true\n  host: 127.0.0.1\n  port: 9\n"
+        "web: {enabled: true, port: 0}\n"
+        "audit: {path: audit.jsonl, min_free_mb: 1000000}\n"
+        "feedback: {light: usb, sound: {enabled: true, device: none-such}}\n",
+    )
+    service = start(config)
+    service.until_told("READY=1")
+    service.until_said("SAFE: ")
+    base = "http://127.0.0.1:" + service.until_said(r"serving http://127\.0\.0\.1:(\d+)")[1]
+    service.until_said("audit: .*no audit log while less than")
+    service.until_said("mqtt: .*trying again")
+    with urllib.request.urlopen(f"{base}/healthz", timeout=PATIENCE_S) as answer:
+        health = json.load(answer)
+    jsonschema.validate(health, json.loads((SCHEMAS / "health.schema.json").read_text()))
+    assert health["state"] == "SAFE"
+    assert not health["light"]["ok"]
+    assert any(fault.startswith("audit: ") for fault in health["faults"])
+    assert health["counters"]["frames"] > 0
+    assert set(health["latency_ms"]) >= {"acquire", "inference", "total", "capture_age"}
+    with urllib.request.urlopen(f"{base}/metrics", timeout=PATIENCE_S) as answer:
+        assert b"bikeped_frames_total" in answer.read()
+    assert not (tmp_path / "audit.jsonl").exists()
+    assert service.stop() == 0
+
+
+async def test_telemetry_of_the_service_from_the_first_fault_to_off(
+    broker, listen, start, make_clip, small_config, tmp_path
+):
+    config = small_config(
+        make_clip("day.avi", 900),
+        more=f"  enabled: true\n  host: 127.0.0.1\n  port: {broker.port}\n  site: whole\n"
+        "audit: {path: audit.jsonl, min_free_mb: 0}\n",
+    )
+    async with listen(broker.port, "bikeped/whole/#") as listener:
+        service = start(config)
+        await listener.until(
+            lambda received: (
+                any(t.endswith("/tracks") for t, _, _ in received)
+                and any(t.endswith("/state") and b'"SAFE"' in p for t, p, _ in received)
+            )
+        )
+        service.process.send_signal(signal.SIGTERM)
+        await listener.until(
+            lambda received: any(
+                t.endswith("/availability") and p == b"offline" for t, p, _ in received
+            )
+        )
+        assert service.wait() == 0
+    for topic, payload, _ in listener.received:
+        suffix = topic.rpartition("/")[2]
+        schema = json.loads((SCHEMAS / f"{suffix}.schema.json").read_text())
+        message = payload.decode() if suffix == "availability" else json.loads(payload)
+        jsonschema.validate(message, schema)
+    states = [json.loads(p)["state"] for p in listener.payloads("state")]
+    assert states[0] == "FAULT"
+    assert states[-2:] == ["SAFE", "OFF"]
+    assert json.loads(listener.payloads("health")[-1])["state"] == "OFF"
+    assert listener.payloads("availability") == [b"online", b"offline"]
+    lines = (tmp_path / "audit.jsonl").read_bytes().splitlines()
+    header = json.loads((SCHEMAS / "event-header.schema.json").read_text())
+    frame = json.loads((SCHEMAS / "event-frame.schema.json").read_text())
+    jsonschema.validate(json.loads(lines[0]), header)
+    for line in lines[1:]:
+        jsonschema.validate(json.loads(line), frame)
+    assert len(lines) > 5
