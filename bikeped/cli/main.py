@@ -19,6 +19,7 @@ COMMANDS = {
     "demo": "bikeped.cli.demo",
     "config": "bikeped.cli.config",
     "doctor": "bikeped.cli.doctor",
+    "conformance": "bikeped.cli.conformance",
 }
 
 
