@@ -188,7 +188,7 @@ def lost(
 
     Independent with probability 1 - recall each; with `burst` (mean length B in frames) as
     Gilbert's two states per agent: recovery 1/B, onset (1 - recall)/(B recall), started in the
-    stationary state. The onset cannot exceed 1: below a recall of 1/(1 + B) losses are denser.
+    stationary state. The onset cannot exceed 1: below a recall of 1/(1 + B) losses are rarer.
     """
     if burst is None:
         return np.asarray((draw >= recall) & present)

@@ -1,0 +1,16 @@
+"""The 24 scenarios before the deployed camera, made once."""
+
+from pathlib import Path
+
+import pytest
+
+from bikeped.config import load_config
+from bikeped.conformance.scenario import bundled_folder, load_scenarios
+from bikeped.conformance.suite import Suite
+
+CONFIG = Path(__file__).parents[2] / "config.yaml"
+
+
+@pytest.fixture(scope="session")
+def suite():
+    return Suite.load(load_scenarios(bundled_folder()), load_config(CONFIG))
