@@ -88,7 +88,7 @@ def gate(
             },
             json_path,
         )
-    _print_gates(f"{candidate} on {len(suite.scenarios)} scenarios", gates, json_path)
+    _print_gates(f"{candidate} on {_count(len(suite.scenarios))}", gates, json_path)
     return 0 if all_hold(gates) else 1
 
 
@@ -134,7 +134,7 @@ def promote(
     gates = check(metrics)
     files = [("candidate", candidate)] + ([("trace", trace)] if trace is not None else [])
     record = provenance_record(suite, decision, metrics, loaded, files)
-    _print_gates(f"{candidate} on {len(suite.scenarios)} scenarios", gates, json_path)
+    _print_gates(f"{candidate} on {_count(len(suite.scenarios))}", gates, json_path)
     out = console(json_path)
     if not all_hold(gates):
         if json_path is not None:
@@ -289,9 +289,7 @@ def plot(
             tell(done)
     if json_path is not None:
         write_json({"files": [str(path) for path in files]}, json_path)
-    console(json_path).print(
-        f"{len(files)} files of {len(indices)} scenarios in {escape(str(out))}"
-    )
+    console(json_path).print(f"{len(files)} files of {_count(len(indices))} in {escape(str(out))}")
     return 0
 
 
@@ -300,6 +298,10 @@ def _suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
     from bikeped.conformance.suite import Suite
 
     return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
+
+
+def _count(scenarios: int) -> str:
+    return f"{scenarios} scenario{'' if scenarios == 1 else 's'}"
 
 
 def _split(overrides: tuple[str, ...]) -> tuple[list[str], list[str]]:
@@ -400,7 +402,7 @@ def _print_contest(data: dict[str, Any], command: str, json_path: str | None) ->
     if changed:
         out.print(_changed_table(before, after, changed))
     same = len(after["by_scenario"]) - len(changed)
-    out.print(f"{len(changed)} scenarios changed, {same} are as before.")
+    out.print(f"Changed: {_count(len(changed))}; as before: {_count(same)}.")
     out.print(f"To repeat: {escape(command)}")
 
 

@@ -56,7 +56,9 @@ def draw_plan(suite: Suite, decision: DecisionConfig, index: int, folder: Path) 
         "alert begins."
     )
     kinds = list(dict.fromkeys(a.kind for a in scenario.agents))
-    rows = 1 + (len(kinds) + 3) // 5
+    entries = len(kinds) + 3
+    columns = entries if entries <= 5 else 3
+    rows = -(-entries // columns)
     with Sheet(f"{scenario.name}: plan", caption, width, height, legend_rows=rows) as sheet:
         axes = sheet.axes[0]
         axes.set_aspect("equal")
@@ -70,7 +72,7 @@ def draw_plan(suite: Suite, decision: DecisionConfig, index: int, folder: Path) 
         _alerts(axes, suite, decision, index)
         axes.set_xlabel("east, m")
         axes.set_ylabel("north, m")
-        sheet.legend(_legend(kinds), columns=5)
+        sheet.legend(_legend(kinds), columns=columns)
         return sheet.save(folder, f"{stem_of(scenario.name)}-plan")
 
 
