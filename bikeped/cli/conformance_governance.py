@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from rich.markup import escape
-from rich.table import Table as RichTable
 
 from bikeped.cli.common import (
     config_options,
@@ -19,12 +18,12 @@ from bikeped.cli.common import (
     write_json,
     write_whole,
 )
+from bikeped.cli.governance_tables import count, print_contest, print_gates, print_register
 from bikeped.config import LoadedConfig, load_config
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError, ConfigError
 
 if TYPE_CHECKING:
-    from bikeped.conformance.gates import Gate
     from bikeped.conformance.suite import Suite
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -88,7 +87,7 @@ def gate(
             },
             json_path,
         )
-    _print_gates(f"{candidate} on {_count(len(suite.scenarios))}", gates, json_path)
+    print_gates(f"{candidate} on {count(len(suite.scenarios))}", gates, json_path)
     return 0 if all_hold(gates) else 1
 
 
@@ -134,7 +133,7 @@ def promote(
     gates = check(metrics)
     files = [("candidate", candidate)] + ([("trace", trace)] if trace is not None else [])
     record = provenance_record(suite, decision, metrics, loaded, files)
-    _print_gates(f"{candidate} on {_count(len(suite.scenarios))}", gates, json_path)
+    print_gates(f"{candidate} on {count(len(suite.scenarios))}", gates, json_path)
     out = console(json_path)
     if not all_hold(gates):
         if json_path is not None:
@@ -211,7 +210,7 @@ def contest(
     command = _command_line(config_path, overrides, scenarios_dir, added, truth, bound)
     if json_path is not None:
         write_json({"command": command, **found.as_dict()}, json_path)
-    _print_contest(found.as_dict(), command, json_path)
+    print_contest(found.as_dict(), command, json_path)
     return 0
 
 
@@ -241,7 +240,7 @@ def register(
         write_json({"config_hash": loaded.hash, **found.as_dict()}, json_path)
     if out is not None:
         write_whole(out, found.markdown())
-    _print_register(found.as_dict(), json_path)
+    print_register(found.as_dict(), json_path)
     return 0
 
 
@@ -289,7 +288,7 @@ def plot(
             tell(done)
     if json_path is not None:
         write_json({"files": [str(path) for path in files]}, json_path)
-    console(json_path).print(f"{len(files)} files of {_count(len(indices))} in {escape(str(out))}")
+    console(json_path).print(f"{len(files)} files of {count(len(indices))} in {escape(str(out))}")
     return 0
 
 
@@ -298,10 +297,6 @@ def _suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
     from bikeped.conformance.suite import Suite
 
     return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
-
-
-def _count(scenarios: int) -> str:
-    return f"{scenarios} scenario{'' if scenarios == 1 else 's'}"
 
 
 def _split(overrides: tuple[str, ...]) -> tuple[list[str], list[str]]:
@@ -340,97 +335,3 @@ def _command_line(
         for value in values:
             words += [flag, str(value)]
     return shlex.join(words)
-
-
-def _print_gates(title: str, gates: list[Gate], json_path: str | None) -> None:
-    table = RichTable(title=escape(title), title_justify="left")
-    for column in ("Gate", "Required", "Measured", "Holds"):
-        table.add_column(column)
-    for g in gates:
-        table.add_row(g.name, g.rule, g.say(g.measured), "yes" if g.holds else "[bold]NO[/bold]")
-    out = console(json_path)
-    out.print(table)
-    failed = [
-        f"{g.name.lower()} {g.say(g.measured)}, required {g.rule}" for g in gates if not g.holds
-    ]
-    out.print("Fails: " + "; ".join(failed) if failed else "All gates hold.")
-
-
-def _print_register(data: dict[str, Any], json_path: str | None) -> None:
-    """Short: the reasons are in the Markdown and the JSON."""
-    out = console(json_path)
-    table = RichTable(title="Residual risks", title_justify="left")
-    for column in ("Failure mode", "Simulated", "Field-blocking"):
-        table.add_column(column)
-    for hazard in data["hazards"]:
-        table.add_row(hazard["hazard"], hazard["coverage"], hazard["field_blocking"])
-    out.print(table)
-    table = RichTable(title="Scenarios", title_justify="left")
-    for column in ("Scenario", "Sens. %", "Spec. %", "SevFN %", "Budget s", "Remark"):
-        table.add_column(column, justify="left" if column in ("Scenario", "Remark") else "right")
-    for row in data["scenarios"]:
-        table.add_row(
-            escape(row["scenario"]),
-            *(_bare(row[k], "%") for k in ("sensitivity", "specificity", "sev_fn")),
-            _bare(row["min_warning_budget_s"], "s"),
-            escape(row["remark"]),
-        )
-    out.print(table)
-
-
-def _print_contest(data: dict[str, Any], command: str, json_path: str | None) -> None:
-    before, after = data["before"], data["after"]
-    out = console(json_path)
-    totals = RichTable(title="Totals", title_justify="left")
-    for column in ("Figure", "Before", "After"):
-        totals.add_column(column, justify="left" if column == "Figure" else "right")
-    for label, key, unit in (
-        ("Sensitivity", "sensitivity", "%"),
-        ("Specificity", "specificity", "%"),
-        ("SevFN", "sev_fn", "%"),
-        ("Fatigue", "fatigue", "%"),
-        ("Contact sensitivity", "contact_sensitivity", "%"),
-        ("Mean warning budget", "mean_warning_budget_s", "s"),
-    ):
-        totals.add_row(label, *(_figure(side["totals"][key], unit) for side in (before, after)))
-    gates = [
-        ", ".join(g["name"].lower() for g in s["gates"] if not g["holds"]) for s in (before, after)
-    ]
-    totals.add_row("Gates", *("all hold" if not g else f"fails: {g}" for g in gates))
-    out.print(totals)
-    changed = {c["scenario"]: c for c in data["changed"]}
-    if changed:
-        out.print(_changed_table(before, after, changed))
-    same = len(after["by_scenario"]) - len(changed)
-    out.print(f"Changed: {_count(len(changed))}; as before: {_count(same)}.")
-    out.print(f"To repeat: {escape(command)}")
-
-
-def _changed_table(
-    before: dict[str, Any], after: dict[str, Any], changed: dict[str, dict[str, Any]]
-) -> RichTable:
-    """By scenario: frames whose state and whose truth changed, and figures before and after."""
-    table = RichTable(title="What changed, before > after", title_justify="left")
-    for column in ("Scenario", "State", "Truth", "ALERT %", "Sens. %", "SevFN %", "Min budget s"):
-        table.add_column(column, justify="left" if column == "Scenario" else "right")
-    for name, entry in changed.items():
-        sides = [s["by_scenario"][name] for s in (before, after) if name in s["by_scenario"]]
-        figures = [" > ".join(_bare(s["states"]["ALERT"], "%") for s in sides)]
-        for key, unit in (("sensitivity", "%"), ("sev_fn", "%"), ("min_warning_budget_s", "s")):
-            figures.append(" > ".join(_bare(side[key], unit) for side in sides))
-        if "frames_state" in entry:
-            frames = [str(entry["frames_state"]), str(entry["frames_truth"])]
-        else:
-            frames = [entry["what"].removesuffix(" scenario"), ""]
-        table.add_row(escape(name), *frames, *figures)
-    return table
-
-
-def _bare(value: float | None, unit: str) -> str:
-    if value is None:
-        return "-"
-    return f"{100 * value:.1f}" if unit == "%" else f"{value:.2f}"
-
-
-def _figure(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{_bare(value, unit)} {unit}"

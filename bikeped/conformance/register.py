@@ -208,7 +208,7 @@ def _scenario(name: str, figures: Mapping[str, Any], hazard: str) -> dict[str, A
     remarks, rating = [], "no"
     if danger == 0:
         remarks.append("no danger")
-    elif danger and not alerted:
+    elif danger and alerted == 0:
         remarks.append("danger, and not one alert in it")
         rating = "yes"
     elif sensitivity is None:

@@ -20,7 +20,7 @@ from bikeped.conformance.register import from_figures
 from bikeped.conformance.tables import Cell, Result, Table
 from bikeped.errors import BikepedError
 
-#: The configuration whose verdict the page gives: the one in force, or else the paper's.
+#: Without the table of scenarios, the verdict is on the comparison's first of these.
 _JUDGED = ("deployed", "selected")
 _CSS = """
 :root{--ink:#1c1c1c;--soft:#55585c;--paper:#fff;--line:#d8dadd;--tint:#f4f5f7;--good:#00614a;
@@ -103,7 +103,7 @@ def _verdict(found: Mapping[str, Result]) -> str:
     """The gates of the configuration in force, in one sentence and a table."""
     name, figures = _judged(found)
     if figures is None:
-        return "<p>No comparison was run, so there is no verdict on the gates.</p>\n"
+        return "<p>Nothing was measured, so there is no verdict on the gates.</p>\n"
     gates = check_figures(figures)
     holds = all_hold(gates)
     failed = " and ".join(g.name.lower() for g in gates if not g.holds)
@@ -131,6 +131,11 @@ def _verdict(found: Mapping[str, Result]) -> str:
 
 
 def _judged(found: Mapping[str, Result]) -> tuple[str, Mapping[str, Any] | None]:
+    """The configuration in force, as the table of scenarios measured it; else the paper's."""
+    run = found.get("run")
+    if run is not None and run.data.get("metrics"):
+        rows = {row["scenario"]: row for row in run.data.get("scenarios", ())}
+        return "in force", {**run.data["metrics"], "by_scenario": rows}
     result = found.get("compare")
     configurations = result.data.get("configurations", {}) if result is not None else {}
     name = next((n for n in _JUDGED if n in configurations), next(iter(configurations), ""))

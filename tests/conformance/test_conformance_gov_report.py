@@ -116,3 +116,14 @@ def test_without_experiments_there_is_a_page_and_no_verdict(tmp_path):
 def test_a_folder_that_is_not_there_is_named():
     with pytest.raises(BikepedError, match="cannot be written"):
         write_index(Path("not") / "there", [], [], {})
+
+
+def test_the_configuration_in_force_is_judged_when_it_was_run(tmp_path):
+    figures = {"sensitivity": 0.5, "specificity": 0.95, "mean_warning_budget_s": 3.0}
+    row = {"scenario": "Here", "danger_frames": 5, **figures}
+    run = Result("run", {"metrics": figures, "scenarios": [row]})
+    better = {"selected": {**figures, "sensitivity": 0.99}}
+    compare = Result("compare", {"configurations": better})
+    text = write_index(tmp_path, [run, compare], [], {}).read_text(encoding="utf-8")
+    assert "may not be promoted" in text
+    assert "not one alert" not in text  # how many alerts there were in danger is not known here
