@@ -434,7 +434,9 @@ def reproduce(
 
 def print_table(screen: Console, table: Table) -> None:
     """A table on a terminal as wide as that is; elsewhere as wide as it needs."""
-    screen.print(rich_table(table), width=None if screen.is_terminal else 250)
+    if not screen.is_terminal:
+        screen.width = 250
+    screen.print(rich_table(table))
 
 
 def rich_table(table: Table) -> RichTable:

@@ -163,11 +163,11 @@ def deployment(
             "pitch, degrees",
             "cameras",
             "width, ft",
-            "sensitivity, %",
+            "sens, %",
             "from, %",
             "to, %",
-            "specificity, %",
-            "visible only: sensitivity, %",
+            "spec, %",
+            "visible only, %",
         ),
         [
             (

@@ -27,14 +27,15 @@ from bikeped.types import BoolArray, State
 
 Progress = Callable[[int], None]
 
-#: The metrics of the short tables: key, column, factor, decimals.
+#: The metrics of the short tables: key, column, factor, decimals. The columns are short, for a
+#: terminal of 80 columns holds them; `contact` is the contact sensitivity.
 SHOWN = (
-    ("sensitivity", "sensitivity, %", 100.0, 1),
-    ("specificity", "specificity, %", 100.0, 1),
+    ("sensitivity", "sens, %", 100.0, 1),
+    ("specificity", "spec, %", 100.0, 1),
     ("sev_fn", "SevFN, %", 100.0, 1),
     ("fatigue", "fatigue, %", 100.0, 1),
-    ("mean_warning_budget_s", "mean budget, s", 1.0, 2),
-    ("contact_sensitivity", "contact sensitivity, %", 100.0, 1),
+    ("mean_warning_budget_s", "budget, s", 1.0, 2),
+    ("contact_sensitivity", "contact, %", 100.0, 1),
 )
 SHOWN_COLUMNS = tuple(column for _, column, _, _ in SHOWN)
 

@@ -67,12 +67,12 @@ def _table(data: Mapping[str, Any], name: str, title: str) -> Table:
         (
             "predictor",
             "delay, ms",
-            "sensitivity, %",
-            "specificity, %",
+            "sens, %",
+            "spec, %",
             "SevFN, %",
             "fatigue, %",
-            "mean budget, s",
-            "contact sensitivity, %",
+            "budget, s",
+            "contact, %",
         ),
         [
             (

@@ -347,8 +347,8 @@ def montecarlo_jobs(trials: int, curve: bool) -> int:
 
 
 def _tables(data: Mapping[str, Any], burst: float, trials: int) -> Iterator[Table]:
-    columns = ("sensitivity, %", "from, %", "to, %", "specificity, %", "SevFN, %", "fatigue, %")
-    ends = ("mean budget, s", "contact sensitivity, %")
+    columns = ("sens, %", "from, %", "to, %", "spec, %", "SevFN, %", "fatigue, %")
+    ends = ("budget, s", "contact, %")
     note = (
         f"{trials} trials; from and to: 95 % confidence interval of the mean; bursts of {burst:g} "
         "frames on average"
