@@ -199,8 +199,11 @@ class Loop:
             slot.put(picture)
 
     async def _until_wanted(self) -> None:
-        """Waits while the eye is sure to be busy: what is taken too early ages in the slot."""
-        if self._looking_since_s is not None:
+        """Waits while the eye is sure to be busy: what is taken too early ages in the slot.
+
+        A recording does not age; there every wait would only cost throughput.
+        """
+        if self._feed.live and self._looking_since_s is not None:
             free_s = self._looking_since_s + self._usual_look_s
             ahead_s = 2 * self._usual_decode_s + 0.005
             await asyncio.sleep(min(max(free_s - ahead_s - time.perf_counter(), 0.0), 0.2))
