@@ -232,8 +232,11 @@ class FrameGrabber:
     def _failed(self, error: CaptureError) -> None:
         self._failures += 1
         with self._lock:
-            self._error = error
-        _log.warning("%s (attempt %d follows)", error, self._failures + 1)
+            known, self._error = self._error, error
+        # A camera that is gone for a month is not a line every few seconds: what is new, and then
+        # the 2nd, 4th, 8th ... time.
+        if str(known) != str(error) or self._failures & (self._failures - 1) == 0:
+            _log.warning("%s (attempt %d follows)", error, self._failures + 1)
 
     def _wake(self) -> None:
         with self._lock:

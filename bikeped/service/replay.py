@@ -149,7 +149,10 @@ async def _replay(
             outputs.append(overlay)
             stack.push_async_callback(overlay.wait)
         # A recording at a desk must not move the lamps of a crossing.
-        light = LightDriver(SimulatedLight, fault_blink_hz=config.feedback.fault_blink_hz)
+        # Nor is a slow desk a stuck service: the deadman has an hour's patience.
+        light = LightDriver(
+            SimulatedLight, fault_blink_hz=config.feedback.fault_blink_hz, deadman_s=3600.0
+        )
         light.start()
         stack.push_async_callback(asyncio.to_thread, light.close)
         loop = Loop(

