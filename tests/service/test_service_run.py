@@ -222,8 +222,11 @@ def test_stopping_while_the_model_loads_is_prompt(start, small_config):
     assert "the light is off" in service.lines[-1]
 
 
-def until_safe(address: str) -> dict[str, object]:
-    """The health report of a moment that is SAFE: on a busy machine frames come late at times."""
+def until_safe_in_the_dark(address: str) -> dict[str, object]:
+    """The health report of a moment that is SAFE with a light that is known to have failed.
+
+    On a busy machine frames come late at times, and so does the USB library's answer.
+    """
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
@@ -233,7 +236,7 @@ def until_safe(address: str) -> dict[str, object]:
         with answer:
             health = json.load(answer)
         assert (answer.status == 503) == (health["state"] == "FAULT")
-        if health["state"] == "SAFE":
+        if health["state"] == "SAFE" and not health["light"]["ok"]:
             return health
         assert time.monotonic() < deadline_s, health
 
@@ -255,9 +258,8 @@ def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp
     base = "http://127.0.0.1:" + service.until_said(r"serving http://127\.0\.0\.1:(\d+)")[1]
     service.until_said("audit: .*no audit log while less than")
     service.until_said("mqtt: .*trying again")
-    health = until_safe(f"{base}/healthz")
+    health = until_safe_in_the_dark(f"{base}/healthz")
     jsonschema.validate(health, json.loads((SCHEMAS / "health.schema.json").read_text()))
-    assert not health["light"]["ok"]
     assert any(fault.startswith("audit: ") for fault in health["faults"])
     assert health["counters"]["frames"] > 0
     assert set(health["latency_ms"]) >= {"acquire", "inference", "total", "capture_age"}
