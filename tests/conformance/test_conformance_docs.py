@@ -1,0 +1,77 @@
+"""docs/scenarios.md says what the 24 scenario files hold.
+
+`python tests/conformance/test_conformance_docs.py` writes it anew.
+"""
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+from bikeped.conformance.scenario import HAZARDS, bundled_folder, load_scenarios
+from bikeped.conformance.simulate import FPS
+from bikeped.conformance.truth import judge_truth
+
+PAGE = Path(__file__).parents[2] / "docs" / "scenarios.md"
+FOLDER = "../bikeped/conformance/scenarios"
+INTRO = """\
+# The 24 scenarios
+
+<!-- Written by `python tests/conformance/test_conformance_docs.py`; a test compares. -->
+
+What the conformance simulation runs: one file a scenario, in
+[bikeped/conformance/scenarios]({folder}).
+They are conformance cases: kinds of encounter that the system must handle, and no statistical
+sample of traffic; none is a recorded event. The world is a plan in metres, x east and y north; the
+crosswalk lies along x = 5, the camera stands at (5, -13) and looks north. Pedestrians walk at 1.0
+to 1.6 m/s (a child 0.9, a wheelchair 0.6, one runner 2.5), cyclists ride at 3 to 8 m/s, e-bikes
+and e-scooters at 6 to 12.5.
+
+Danger frames are those that the kinematic truth calls dangerous (30 a second); of these the
+actionable ones leave a distracted pedestrian time to react (TTC of at least 1.87 s). {danger} of the
+{count} scenarios hold danger, {actionable} actionable danger: Fast Approach and Occluded Emergence are over too
+soon for any warning. `--scenarios DIR` on every conformance command takes your own files in their
+place.
+"""
+SWERVE = """
+**Swerving Cyclist** shows a limit of the rule, on purpose: while the cyclist cuts in, the way
+gained ahead hides the way lost to the side, the distance stops shrinking, and the alert of the
+swerve begins at the closest approach, with no time left.
+"""
+
+
+def page(scenarios):
+    truths = {s.name: judge_truth(s) for s in scenarios}
+    lines = [
+        INTRO.format(
+            folder=FOLDER,
+            count=len(scenarios),
+            danger=sum(t.danger.any() for t in truths.values()),
+            actionable=sum(t.actionable.any() for t in truths.values()),
+        ),
+        "| scenario | hazard | story | seconds | agents | danger frames | actionable |",
+        "| --- | --- | --- | ---: | --- | ---: | ---: |",
+    ]
+    for s in sorted(scenarios, key=lambda s: (HAZARDS.index(s.hazard), s.name)):
+        truth = truths[s.name]
+        seconds = len(truth.time_s) / FPS
+        lines.append(
+            f"| [{s.name}]({FOLDER}/{Path(s.source).name}) | {s.hazard} | {s.story} | "
+            f"{seconds:.1f} | {agents(s)} | {truth.danger.sum()} | {truth.actionable.sum()} |"
+        )
+    return "\n".join(lines) + "\n" + SWERVE
+
+
+def agents(scenario):
+    counts = Counter(a.kind for a in scenario.agents)
+    words = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items()]
+    return ", ".join(words) + (" (e-bike braking)" if scenario.vehicle == "ebike" else "")
+
+
+def test_the_page_is_current(suite):
+    mend = "run: python tests/conformance/test_conformance_docs.py"
+    assert PAGE.read_text(encoding="utf-8") == page(suite.scenarios), mend
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(load_scenarios(bundled_folder())), encoding="utf-8")
+    sys.stdout.write(f"{PAGE}\n")
