@@ -27,10 +27,10 @@ to 1.6 m/s (a child 0.9, a wheelchair 0.6, one runner 2.5), cyclists ride at 3 t
 and e-scooters at 6 to 12.5.
 
 Danger frames are those that the kinematic truth calls dangerous (30 a second); of these the
-actionable ones leave a distracted pedestrian time to react (TTC of at least 1.87 s). {danger} of the
-{count} scenarios hold danger, {actionable} actionable danger: Fast Approach and Occluded Emergence are over too
-soon for any warning. `--scenarios DIR` on every conformance command takes your own files in their
-place.
+actionable ones leave a distracted pedestrian time to react (TTC of at least 1.87 s).
+{danger} of the {count} scenarios hold danger, {actionable} actionable danger: Fast Approach and
+Occluded Emergence are over too soon for any warning. `--scenarios DIR` on every conformance command
+takes your own files in their place.
 """
 SWERVE = """
 **Swerving Cyclist** shows a limit of the rule, on purpose: while the cyclist cuts in, the way
