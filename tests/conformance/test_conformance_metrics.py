@@ -113,7 +113,7 @@ def same(value, expected):
     assert value == pytest.approx(expected, abs=1e-12, nan_ok=True)
 
 
-@settings(derandomize=True, deadline=None, max_examples=300)
+@settings(derandomize=True, deadline=None, max_examples=150)
 @given(SCENARIOS)
 def test_any_sequence_against_a_plain_loop(scenarios):
     found = measured(scenarios)

@@ -18,7 +18,7 @@ from bikeped.types import State
 ALERT = int(State.ALERT)
 PAIRWISE = [n for n, c in CONFIGURATIONS.items() if c.rule == "pairwise"]
 AT = np.array([SIMULATION_POSE.x_m, SIMULATION_POSE.y_m])
-QUICK = settings(derandomize=True, deadline=None, max_examples=60)
+QUICK = settings(derandomize=True, deadline=None, max_examples=30)
 
 
 def with_paths(scenario, change):
