@@ -7,14 +7,11 @@ how the trials are spread over processes, and all ways of losing detections shar
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
-import multiprocessing
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +25,7 @@ from bikeped.conformance.perception import RecallMode, RecallModel, Seen, lost, 
 from bikeped.conformance.simulate import Scene, Tracked, delayed, rows_of, states, track
 from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.tables import Result, Table
+from bikeped.conformance.workers import workers
 from bikeped.errors import BikepedError
 from bikeped.types import BoolArray, FloatArray, KindArray
 
@@ -38,13 +36,6 @@ BURST_FRAMES = 5.0
 CHUNK_BYTES = 60_000_000
 #: Reported, id, kind, and three vectors, of one slot in one frame.
 _SLOT_BYTES = 1 + 8 + 1 + 3 * 16
-#: Environment that keeps each worker process on one core.
-_ONE_THREAD = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
 
 #: Delay in frames, order of the predictor.
 Case = tuple[int, int]
@@ -162,21 +153,6 @@ def sorted_suite(suite: Suite) -> Suite:
     return replace(suite, scenarios=tuple(sorted(suite.scenarios, key=lambda s: s.name)))
 
 
-@contextlib.contextmanager
-def pool(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes on one core each, started afresh: a fork would copy our threads' locks."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
-    try:
-        yield executor
-    finally:
-        # After an interruption what waits is dropped, what runs is waited for.
-        executor.shutdown(cancel_futures=True)
-        for name, value in before.items():
-            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
-
-
 def plan_trials(
     suite: Suite,
     plan: Plan,
@@ -205,22 +181,20 @@ def run_plans(
     parts = [range(trials)[i :: _parts(trials)] for i in range(_parts(trials))]
     jobs = [(i, part) for i in range(len(plans)) for part in parts]
     done: dict[tuple[int, int], dict[Case, TrialMetrics]] = {}
-    with contextlib.ExitStack() as stack:
-        executor: Executor | None = None
-        if processes > 1 and len(jobs) > 1:
-            executor = stack.enter_context(pool(processes))
+    if processes > 1 and len(jobs) > 1:
+        with workers(min(processes, len(jobs))) as pool:
             waiting = {
-                executor.submit(plan_trials, suite, plans[i], configurations, part, seed): (i, part)
+                pool.submit(plan_trials, suite, plans[i], configurations, part, seed): (i, part)
                 for i, part in jobs
             }
             for count, future in enumerate(as_completed(waiting)):
                 i, part = waiting[future]
                 done[i, part.start] = future.result()
                 progress(count + 1)
-        else:
-            for count, (i, part) in enumerate(jobs):
-                done[i, part.start] = plan_trials(suite, plans[i], configurations, part, seed)
-                progress(count + 1)
+    else:
+        for count, (i, part) in enumerate(jobs):
+            done[i, part.start] = plan_trials(suite, plans[i], configurations, part, seed)
+            progress(count + 1)
     merged = []
     for i, plan in enumerate(plans):
         whole: dict[Case, TrialMetrics] = {}

@@ -13,7 +13,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,7 @@ from bikeped.conformance.experiments import Progress, provenance, quiet
 from bikeped.conformance.perception import RecallModel
 from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.tables import Result, Table
+from bikeped.conformance.workers import workers
 from bikeped.errors import BikepedError
 
 #: Packages whose source decides what an experiment gives.
@@ -182,6 +183,13 @@ def compute(
     return result, time.perf_counter() - begin
 
 
+def draw(result: Result, suite: Suite, folder: Path) -> list[Path]:
+    """The figures of one experiment: the job of a process too."""
+    from bikeped.conformance.figures import draw_all
+
+    return draw_all({result.name: result.data}, suite, folder)
+
+
 @dataclass(frozen=True)
 class Reproduction:
     """What a run left: results in the order of the page, those reused, files, seconds."""
@@ -234,29 +242,45 @@ def reproduce(
 
     _ = suite.truth_frames, suite.run  # made once, before the suite goes to every process
     missing = [name for name in EXPERIMENTS if name not in found]
-    if processes > 1 and len(missing) > 1:
-        with montecarlo.pool(min(processes, len(missing))) as executor:
-            waiting: dict[Future[tuple[Result, float]], str] = {
-                executor.submit(compute, name, suite, loaded, settings): name for name in missing
-            }
-            for future in as_completed(waiting):
-                keep(waiting[future], *future.result())
+    pictures: dict[str, list[Path]] = {}
+    if processes > 1:
+        with workers(processes) as pool:
+            jobs: dict[Future[Any], tuple[str, bool]] = {}
+
+            def picture(name: str) -> None:
+                if figures:
+                    job = pool.submit(draw, found[name], suite, folder / "figures")
+                    jobs[job] = (name, True)
+
+            for name in missing:
+                jobs[pool.submit(compute, name, suite, loaded, settings)] = (name, False)
+            for name in reused:
+                picture(name)
+            while jobs:
+                for job in wait(jobs, return_when=FIRST_COMPLETED).done:
+                    name, is_picture = jobs.pop(job)
+                    if is_picture:
+                        pictures[name] = job.result()
+                    else:
+                        keep(name, *job.result())
+                        picture(name)
     else:
         for name in missing:
             keep(name, *compute(name, suite, loaded, settings))
+        if figures:
+            for name, result in found.items():
+                pictures[name] = draw(result, suite, folder / "figures")
 
     results = tuple(found[name] for name in SHOWN_ORDER)
     for result in results:
         for table in result.tables:
             write_text(table_folder / f"{table.name}.csv", table.csv())
             write_text(table_folder / f"{table.name}.json", _json(_table_dict(table)))
-    drawn: tuple[Path, ...] = ()
+    drawn = tuple(path for name in SHOWN_ORDER for path in pictures.get(name, []))
     index: Path | None = None
     if figures:
-        from bikeped.conformance.figures import draw_all
         from bikeped.conformance.report import write_index
 
-        drawn = tuple(draw_all({r.name: r.data for r in results}, suite, folder / "figures"))
         said = {
             "version": str(stamp["version"]),
             "scenarios": str(stamp["scenarios"]),

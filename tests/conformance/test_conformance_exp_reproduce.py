@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -100,6 +105,26 @@ def test_resumes_after_an_interruption(
     found = rep.reproduce(suite, LOADED, tmp_path, SMALL, figures=False)
     assert set(found.reused) == set(names[:4])
     assert len(found.results) == len(names)
+
+
+def test_interrupted_from_the_terminal_it_ends_at_once(tmp_path: Path) -> None:
+    """As Ctrl-C does it: the signal goes to the whole group, workers included."""
+    command = [sys.executable, "-m", "bikeped.cli.main", "conformance", "reproduce", "--no-figures"]
+    command += ["-c", str(CONFIG), "--out", str(tmp_path), "--processes", "2", "--trials", "2000"]
+    with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE) as process:
+        data = tmp_path / "data"
+        while not data.is_dir():
+            time.sleep(0.05)
+            assert process.poll() is None
+        time.sleep(1.5)  # the workers are starting, or have long jobs: at any moment it must end
+        os.killpg(process.pid, signal.SIGINT)
+        begin = time.monotonic()
+        _, said = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 30
+    assert process.returncode == 130
+    assert said.decode().split() == ["bikeped:", "interrupted"]
+    for file in data.iterdir():
+        json.loads(file.read_text())
 
 
 def test_key_covers_what_a_result_depends_on(suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
