@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 from rich.markup import escape
-from rich.table import Table as RichTable
 
 from bikeped.cli.common import (
     check_json_target,
-    config_options,
     console,
-    json_option,
     progress_bar,
     write_json,
     write_whole,
 )
-from bikeped.cli.conformance_governance import add_commands, scenarios_option
-from bikeped.config import LoadedConfig, load_config
+from bikeped.cli.conformance_governance import add_commands
+from bikeped.cli.conformance_shared import (
+    begin,
+    burst_option,
+    cores,
+    curve_option,
+    emit,
+    optimizer,
+    print_table,
+    processes_option,
+    stamp,
+    suite_options,
+    trials_option,
+)
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
-    from bikeped.conformance.suite import Suite
-    from bikeped.conformance.tables import Cell, Result, Table
-
-F = TypeVar("F", bound=Callable[..., Any])
+    pass
 
 
 @click.group("conformance")
@@ -41,57 +44,15 @@ def command() -> None:
 add_commands(command)
 
 
-def suite_options(function: F) -> F:
-    """`-c`, `--set`, `--scenarios`, `--seed` and `--json`, on every experiment."""
-    for option in (
-        json_option,
-        click.option(
-            "--seed",
-            type=click.IntRange(0, 2**32 - 1),
-            help="Seed of everything random; it is told in the JSON. Default: 0; optimize: 42.",
-        ),
-        scenarios_option,
-        config_options,
-    ):
-        function = option(function)
-    return function
-
-
-def trials_option(default: int) -> Callable[[F], F]:
-    """`--trials`."""
-    return click.option(
-        "--trials",
-        type=click.IntRange(1, 100_000),
-        default=default,
-        show_default=True,
-        help="Random repetitions.",
-    )
-
-
-processes_option = click.option(
-    "--processes",
-    type=click.IntRange(1, 256),
-    help="Processes; default: one a core. The figures do not depend on it.",
-)
-curve_option = click.option(
-    "--recall-curve",
-    "curve_path",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Recall over projected area: CSV or JSON of bin centre (square pixels), recall.",
-)
-burst_option = click.option(
-    "--burst",
-    type=click.FloatRange(1, 1000),
-    default=5.0,
-    show_default=True,
-    help="Mean length of a burst of misses, in frames.",
-)
-
-
 @command.command("run")
 @suite_options
 @click.option("--scenario", "name", metavar="NAME", help="Only this scenario.")
+@click.option(
+    "--audit",
+    "audit_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write every frame's true and observed positions, state and danger as JSON Lines.",
+)
 def run(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -99,14 +60,18 @@ def run(
     seed: int | None,
     json_path: str | None,
     name: str | None,
+    audit_path: Path | None,
 ) -> None:
     """Every scenario under the configuration: states, misses, false alerts, warning budgets."""
+    from bikeped.conformance.audit import write_audit
     from bikeped.conformance.experiments import one_scenario, run_table
 
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     if name is not None:
         suite = one_scenario(suite, name)
-    _emit(run_table(suite, loaded.config.decision), suite, loaded, seed or 0, json_path)
+    if audit_path is not None:
+        write_audit(audit_path, suite, loaded.config.decision, loaded, seed or 0)
+    emit(run_table(suite, loaded.config.decision), suite, loaded, seed or 0, json_path)
 
 
 @command.command("compare")
@@ -138,9 +103,9 @@ def compare(
         if name in configurations:
             raise BikepedError(f"--configuration {name}: the name is taken; choose another")
         configurations[name] = load_decision(Path(file))
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     result = compare_table(suite, loaded, configurations, seed or 0)
-    _emit(result, suite, loaded, seed or 0, json_path)
+    emit(result, suite, loaded, seed or 0, json_path)
 
 
 @command.command("errors")
@@ -155,8 +120,8 @@ def errors(
     """How far off the camera puts pedestrians, cyclists and cars, by distance and bearing."""
     from bikeped.conformance.experiments import errors as localisation_errors
 
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
-    _emit(localisation_errors(suite), suite, loaded, seed or 0, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    emit(localisation_errors(suite), suite, loaded, seed or 0, json_path)
 
 
 @command.command("truth")
@@ -172,12 +137,12 @@ def truth(
     from bikeped.conformance.experiments import braking_profiles, truth_sensitivity
     from bikeped.conformance.tables import Result
 
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     decision = loaded.config.decision
     thresholds, braking = truth_sensitivity(suite, decision), braking_profiles(suite, decision)
     data = {**thresholds.data, "braking": braking.data}
     result = Result("truth", data, (*thresholds.tables, *braking.tables))
-    _emit(result, suite, loaded, seed or 0, json_path)
+    emit(result, suite, loaded, seed or 0, json_path)
 
 
 @command.command("montecarlo")
@@ -205,17 +170,17 @@ def montecarlo(
     from bikeped.conformance.suite import CONFIGURATIONS
 
     curve = None if curve_path is None else mc.load_recall_curve(curve_path)
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     configurations = dict(CONFIGURATIONS)
     if loaded.config.decision not in configurations.values():
         configurations = {"configured": loaded.config.decision, **configurations}
-    workers = processes or _cores()
+    workers = processes or cores()
     jobs = mc.montecarlo_jobs(trials, curve is not None)
     with progress_bar("trials", jobs) as progress:
         result = mc.montecarlo(
             suite, configurations, trials, seed or 0, burst, curve, workers, progress
         )
-    _emit(result, suite, loaded, seed or 0, json_path)
+    emit(result, suite, loaded, seed or 0, json_path)
 
 
 @command.command("latency")
@@ -246,12 +211,12 @@ def latency(
     if not loss and (bursts or curve_path is not None):
         raise BikepedError("latency: --bursts and --recall-curve belong to --loss; add it")
     curve = None if curve_path is None else mc.load_recall_curve(curve_path)
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     decision = loaded.config.decision
     if not loss:
         result = late.sweep(suite, decision)
     else:
-        workers = processes or _cores()
+        workers = processes or cores()
         jobs = mc.plan_jobs(1, trials)
         with progress_bar("trials", jobs) as progress:
             result = late.sweep_with_loss(
@@ -264,7 +229,7 @@ def latency(
                 processes=workers,
                 progress=progress,
             )
-    _emit(result, suite, loaded, seed or 0, json_path)
+    emit(result, suite, loaded, seed or 0, json_path)
 
 
 @command.command("optimize")
@@ -300,18 +265,16 @@ def optimize(
     out: Path | None,
 ) -> None:
     """Search the decision's five parameters by differential evolution."""
-    optimizer = _optimizer()
+    search = optimizer()
     if out is not None:
         check_json_target(str(out))
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
-    chosen = optimizer.SEED if seed is None else seed
-    with progress_bar("evaluations", optimizer.evaluations(maxiter, popsize)) as progress:
-        result = optimizer.optimize(
-            suite, loaded.config.decision, chosen, maxiter, popsize, progress
-        )
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    chosen = search.SEED if seed is None else seed
+    with progress_bar("evaluations", search.evaluations(maxiter, popsize)) as progress:
+        result = search.optimize(suite, loaded.config.decision, chosen, maxiter, popsize, progress)
     if out is not None:
-        write_whole(out, optimizer.candidate_yaml(result, suite.hash, loaded.hash))
-    _emit(result, suite, loaded, chosen, json_path)
+        write_whole(out, search.candidate_yaml(result, suite.hash, loaded.hash))
+    emit(result, suite, loaded, chosen, json_path)
     if out is not None:
         console(json_path).print(f"wrote {escape(str(out))}")
 
@@ -330,12 +293,12 @@ def deployment(
     """Road widths with one camera and with two."""
     from bikeped.conformance import deployment as roads
 
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     with progress_bar("road widths", len(roads.WIDTHS_FT)) as progress:
         result = roads.deployment(
             suite.camera, loaded.config.decision, trials, seed or 0, progress=progress
         )
-    _emit(result, suite, loaded, seed or 0, json_path)
+    emit(result, suite, loaded, seed or 0, json_path)
 
 
 @command.command("placement")
@@ -352,12 +315,12 @@ def placement(
     """Camera height by pitch on a road of 40 ft."""
     from bikeped.conformance import deployment as roads
 
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     with progress_bar("heights", len(roads.HEIGHTS_M)) as progress:
         result = roads.placement(
             suite.camera, loaded.config.decision, trials, seed or 0, progress=progress
         )
-    _emit(result, suite, loaded, seed or 0, json_path)
+    emit(result, suite, loaded, seed or 0, json_path)
 
 
 @command.command("reproduce")
@@ -388,7 +351,7 @@ def reproduce(
     no_figures: bool,
 ) -> None:
     """All experiments with every table and figure; resumes where it was interrupted."""
-    _optimizer()  # says at once when SciPy is not there
+    optimizer()  # says at once when SciPy is not there
     from bikeped.conformance import reproduce as whole
     from bikeped.conformance.experiments import shown
     from bikeped.conformance.montecarlo import load_recall_curve
@@ -399,11 +362,11 @@ def reproduce(
 
         require_matplotlib()
     curve = None if curve_path is None else load_recall_curve(curve_path)
-    loaded, suite = _begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
     settings = whole.Settings(trials=trials, seed=seed or 0, burst=burst, curve=curve)
     with progress_bar("experiments", len(whole.EXPERIMENTS) + 1) as progress:
         found = whole.reproduce(
-            suite, loaded, out, settings, processes or _cores(), not no_figures, progress
+            suite, loaded, out, settings, processes or cores(), not no_figures, progress
         )
     data = {r.name: r.data for r in found.results}
     if json_path is not None:
@@ -414,7 +377,7 @@ def reproduce(
                 "seconds": dict(found.seconds),
                 "figures": [str(path) for path in found.figures],
                 "index": None if found.index is None else str(found.index),
-                **_stamp(suite, loaded, seed or 0),
+                **stamp(suite, loaded, seed or 0),
                 "results": data,
             },
             json_path,
@@ -430,91 +393,3 @@ def reproduce(
     )
     if found.index is not None:
         screen.print(f"see {escape(str(found.index))}")
-
-
-def print_table(screen: Console, table: Table) -> None:
-    """A table on a terminal as wide as that is; elsewhere as wide as it needs."""
-    if not screen.is_terminal:
-        screen.width = 250
-    screen.print(rich_table(table))
-
-
-def rich_table(table: Table) -> RichTable:
-    """A table for a terminal: per cent with one decimal, seconds with two."""
-    drawn = RichTable(
-        title=escape(table.title),
-        title_justify="left",
-        caption=escape(table.note) or None,
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
-    )
-    for column, name in enumerate(table.columns):
-        is_text = any(isinstance(row[column], str) for row in table.rows)
-        drawn.add_column(escape(name), justify="left" if is_text else "right")
-    for row in table.rows:
-        drawn.add_row(*(_cell(cell, name) for cell, name in zip(row, table.columns, strict=True)))
-    return drawn
-
-
-def _cell(cell: Cell, column: str) -> str:
-    if cell is None:
-        return "-"
-    if isinstance(cell, float) and column.endswith("%"):
-        return f"{cell:.1f}"
-    if isinstance(cell, float) and column.endswith(", s"):
-        return f"{cell:.2f}"
-    return f"{cell:g}" if isinstance(cell, float) else escape(str(cell))
-
-
-def _begin(
-    config_path: Path | None,
-    overrides: tuple[str, ...],
-    scenarios_dir: Path | None,
-    json_path: str | None,
-) -> tuple[LoadedConfig, Suite]:
-    """Configuration and suite, and every quick check before the work."""
-    from bikeped.conformance.scenario import bundled_folder, load_scenarios
-    from bikeped.conformance.suite import Suite
-
-    check_json_target(json_path)
-    loaded = load_config(config_path, overrides)
-    scenarios = load_scenarios(scenarios_dir or bundled_folder())
-    return loaded, Suite.load(scenarios, loaded)
-
-
-def _emit(
-    result: Result, suite: Suite, loaded: LoadedConfig, seed: int, json_path: str | None
-) -> None:
-    """JSON where it is asked for, tables for people unless standard output is JSON's."""
-    if json_path is not None:
-        write_json({**_stamp(suite, loaded, seed), **result.data}, json_path)
-    if json_path == "-":
-        return
-    screen = console()
-    for table in result.tables:
-        print_table(screen, table)
-        screen.print()
-
-
-def _stamp(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
-    from bikeped.conformance.experiments import provenance
-
-    return provenance(suite, loaded, seed)
-
-
-def _optimizer() -> Any:
-    try:
-        from bikeped.conformance import optimizer
-    except ImportError as error:
-        raise BikepedError(
-            f"{error.name}: not installed; install bikeped[sim] for the optimiser"
-        ) from error
-    return optimizer
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -11,17 +11,19 @@ from bikeped.config.load import (
     parse_config,
 )
 from bikeped.config.sections import (
-    AuditConfig,
     CameraConfig,
     Config,
     DecisionConfig,
     DetectionConfig,
+    LatencyConfig,
+    TrackingConfig,
+)
+from bikeped.config.sections_output import (
+    AuditConfig,
     FeedbackConfig,
     GpioConfig,
-    LatencyConfig,
     MqttConfig,
     SoundConfig,
-    TrackingConfig,
     UsbConfig,
     WebConfig,
 )

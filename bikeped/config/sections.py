@@ -1,4 +1,4 @@
-"""Every key of `config.yaml`: its type, range, default and meaning.
+"""Every key of `config.yaml`: its type, range, default and meaning. (Outputs: `sections_output`.)
 
 The descriptions here are the source of `docs/configuration.md` and of `bikeped config schema`.
 Values that the paper gives in frames stay in frames here (people know them so) and are turned into
@@ -12,12 +12,16 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from bikeped.config.section import Section
+from bikeped.config.sections_output import (
+    AuditConfig,
+    FeedbackConfig,
+    MqttConfig,
+    WebConfig,
+)
+
 # Finite by construction: msgspec refuses NaN only where a bound is given, so every float has one.
-Metres = Annotated[float, Meta(ge=0, le=1000)]
-Seconds = Annotated[float, Meta(ge=0, le=3600)]
-Ratio = Annotated[float, Meta(ge=0, le=1)]
 Radial = Annotated[float, Meta(ge=-10, le=10)]
-Line = Annotated[str, Meta(min_length=1)] | Annotated[int, Meta(ge=0, le=4095)]
 Projection = Literal[
     "equidistant",
     "equisolid",
@@ -29,13 +33,7 @@ Projection = Literal[
 ]
 
 
-class _Section(
-    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=False
-):
-    """Base of all sections: immutable, no unknown keys."""
-
-
-class CameraConfig(_Section, frozen=True):
+class CameraConfig(Section, frozen=True):
     """The camera: where pictures come from, its lens, and how it hangs."""
 
     source: Annotated[
@@ -162,7 +160,7 @@ class CameraConfig(_Section, frozen=True):
     ] = 15.0
 
 
-class DetectionConfig(_Section, frozen=True):
+class DetectionConfig(Section, frozen=True):
     """The detector: the model file, its layout, and what is kept of its answer."""
 
     model: Annotated[
@@ -245,7 +243,7 @@ class DetectionConfig(_Section, frozen=True):
     ] = 0.5
 
 
-class TrackingConfig(_Section, frozen=True):
+class TrackingConfig(Section, frozen=True):
     """The tracker, in ground metres."""
 
     match_radius_m: Annotated[
@@ -307,7 +305,7 @@ class TrackingConfig(_Section, frozen=True):
     ] = 0.75
 
 
-class DecisionConfig(_Section, frozen=True):
+class DecisionConfig(Section, frozen=True):
     """The three-stage rule. The defaults are the paper's selected configuration."""
 
     rule: Annotated[
@@ -354,159 +352,7 @@ class DecisionConfig(_Section, frozen=True):
     ] = 30.0
 
 
-class GpioConfig(_Section, frozen=True):
-    """A light on GPIO lines."""
-
-    chip: Annotated[
-        str, Meta(min_length=1, description="chip by label, name or path, e.g. tegra234-gpio")
-    ] = "tegra234-gpio"
-    red: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
-    orange: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
-    green: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
-    blue: Annotated[Line | None, Meta(description="line name or offset; null: not wired")] = None
-    active_low: Annotated[bool, Meta(description="a low line lights the lamp")] = False
-
-
-class UsbConfig(_Section, frozen=True):
-    """A USB light or relay board."""
-
-    device: Annotated[
-        Literal["blink1", "luxafor", "relay"],
-        Meta(
-            description="blink1: ThingM blink(1); luxafor: Luxafor Flag; relay: HID relay board "
-            "16c0:05df, one relay a colour"
-        ),
-    ] = "relay"
-    serial: Annotated[
-        str | None, Meta(description="serial number when several are plugged in; null: first")
-    ] = None
-    relay_red: Annotated[int, Meta(ge=0, le=8, description="relay of red; 0: not wired")] = 1
-    relay_orange: Annotated[int, Meta(ge=0, le=8, description="relay of orange; 0: not wired")] = 2
-    relay_green: Annotated[int, Meta(ge=0, le=8, description="relay of green; 0: not wired")] = 3
-    relay_blue: Annotated[int, Meta(ge=0, le=8, description="relay of blue; 0: not wired")] = 4
-
-
-class SoundConfig(_Section, frozen=True):
-    """The speaker."""
-
-    enabled: Annotated[bool, Meta(description="play chime and bell")] = False
-    device: Annotated[str, Meta(min_length=1, description="ALSA device, as aplay -D takes it")] = (
-        "default"
-    )
-    volume: Annotated[Ratio, Meta(description="0 is silent, 1 is full scale")] = 0.8
-    chime: Annotated[str | None, Meta(description="WAV file of the chime; null: bikeped's own")] = (
-        None
-    )
-    bell: Annotated[str | None, Meta(description="WAV file of the bell; null: bikeped's own")] = (
-        None
-    )
-    chime_cooldown_s: Annotated[
-        float, Meta(ge=0, le=3600, description="shortest time between two chimes, seconds")
-    ] = 5.0
-    bell_cooldown_s: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=3600,
-            description="shortest time between two bells; while ALERT lasts the bell repeats, s",
-        ),
-    ] = 1.5
-
-
-class FeedbackConfig(_Section, frozen=True):
-    """The light and the speaker."""
-
-    light: Annotated[
-        Literal["simulated", "gpio", "usb"],
-        Meta(description="simulated writes to the log"),
-    ] = "simulated"
-    blink_hz: Annotated[
-        float, Meta(gt=0, le=10, description="blinking of ALERT's red, flashes per second")
-    ] = 2.0
-    fault_blink_hz: Annotated[
-        float,
-        Meta(gt=0, le=10, description="blinking of FAULT's orange, flashes per second"),
-    ] = 0.5
-    hold_alert_s: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=10,
-            description="the light keeps ALERT at least this long, so that one frame is seen, s",
-        ),
-    ] = 1.0
-    recover_frames: Annotated[
-        int,
-        Meta(ge=1, le=300, description="good frames in a row before the light leaves FAULT"),
-    ] = 5
-    gpio: GpioConfig = msgspec.field(default_factory=GpioConfig)
-    usb: UsbConfig = msgspec.field(default_factory=UsbConfig)
-    sound: SoundConfig = msgspec.field(default_factory=SoundConfig)
-
-
-class MqttConfig(_Section, frozen=True):
-    """Telemetry."""
-
-    enabled: Annotated[bool, Meta(description="publish to the broker")] = False
-    host: Annotated[str, Meta(min_length=1, description="broker's name or address")] = "localhost"
-    port: Annotated[int, Meta(ge=1, le=65535, description="broker's port")] = 1883
-    site: Annotated[
-        str,
-        Meta(
-            pattern="^[^/+#\\x00]+$",
-            max_length=64,
-            description="the <site> of the topics bikeped/<site>/...",
-        ),
-    ] = "crossing"
-    qos: Annotated[int, Meta(ge=0, le=2, description="quality of service of state and health")] = 1
-    publish_interval_s: Annotated[
-        float, Meta(ge=0.01, le=3600, description="time between two track messages, seconds")
-    ] = 0.1
-    health_interval_s: Annotated[
-        float, Meta(ge=0.1, le=3600, description="time between two health messages, seconds")
-    ] = 10.0
-    keepalive_s: Annotated[int, Meta(ge=1, le=3600, description="MQTT keep-alive, seconds")] = 15
-    username: Annotated[str | None, Meta(description="user name; null: none")] = None
-    password_file: Annotated[
-        str | None, Meta(description="file whose first line is the password; null: none")
-    ] = None
-    tls: Annotated[bool, Meta(description="encrypt the connection")] = False
-    ca_file: Annotated[str | None, Meta(description="CA certificates; null: the system's")] = None
-    cert_file: Annotated[str | None, Meta(description="client certificate; null: none")] = None
-    key_file: Annotated[str | None, Meta(description="key of the client certificate")] = None
-    home_assistant: Annotated[
-        bool, Meta(description="announce the entities for Home Assistant's discovery")
-    ] = False
-    discovery_prefix: Annotated[
-        str, Meta(min_length=1, description="Home Assistant's discovery prefix")
-    ] = "homeassistant"
-
-
-class WebConfig(_Section, frozen=True):
-    """The HTTP server."""
-
-    enabled: Annotated[bool, Meta(description="serve /metrics and /healthz")] = False
-    host: Annotated[str, Meta(min_length=1, description="address to bind")] = "127.0.0.1"
-    port: Annotated[int, Meta(ge=0, le=65535, description="port to bind; 0: any free one")] = 8080
-
-
-class AuditConfig(_Section, frozen=True):
-    """The audit log: one JSON line a frame."""
-
-    path: Annotated[str | None, Meta(description="file to append to; null writes no audit log")] = (
-        None
-    )
-    max_mb: Annotated[
-        float, Meta(ge=0.01, le=100000, description="size at which the file is rotated, MB")
-    ] = 100.0
-    keep: Annotated[int, Meta(ge=1, le=1000, description="rotated files that are kept")] = 10
-    min_free_mb: Annotated[
-        float,
-        Meta(ge=0, le=1000000, description="nothing is written with less free disk than this, MB"),
-    ] = 500.0
-
-
-class LatencyConfig(_Section, frozen=True):
+class LatencyConfig(Section, frozen=True):
     """Compensation of the time between capture and decision."""
 
     compensation: Annotated[
@@ -535,7 +381,7 @@ class LatencyConfig(_Section, frozen=True):
     ] = 0.0
 
 
-class Config(_Section, frozen=True):
+class Config(Section, frozen=True):
     """The whole configuration."""
 
     camera: CameraConfig = msgspec.field(default_factory=CameraConfig)

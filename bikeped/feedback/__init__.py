@@ -17,7 +17,7 @@ from bikeped.feedback.speaker import Speaker
 from bikeped.feedback.usb import UsbLight, relay_lamps
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import FeedbackConfig
+    from bikeped.config import FeedbackConfig
 
 __all__ = [
     "OFF",

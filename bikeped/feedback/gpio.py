@@ -18,7 +18,7 @@ from bikeped.feedback.light import Lamp, assign_lamps
 from bikeped.types import Colour
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import GpioConfig
+    from bikeped.config import GpioConfig
 
 SECTION = "feedback.gpio"
 

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 from bikeped.types import Colour, Signal, Sound, State
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import FeedbackConfig
+    from bikeped.config import FeedbackConfig
 
 #: What `Signal.faults` says before the first good frames came.
 STARTING = "starting: not enough good frames yet"

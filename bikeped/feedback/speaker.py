@@ -20,7 +20,7 @@ from bikeped.feedback.sounds import duration_s, load_wav, make_wav
 from bikeped.types import Sound
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import SoundConfig
+    from bikeped.config import SoundConfig
 
 _log = logging.getLogger(__name__)
 

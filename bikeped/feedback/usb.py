@@ -27,7 +27,7 @@ from bikeped.feedback.light import Lamp, assign_lamps
 from bikeped.types import Colour
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import UsbConfig
+    from bikeped.config import UsbConfig
 
 SECTION = "feedback.usb"
 TIMEOUT_MS = 300

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from bikeped.config.sections import AuditConfig
+from bikeped.config import AuditConfig
 from bikeped.telemetry.messages import EventHeader, EventLine, encode_line
 
 log = logging.getLogger(__name__)

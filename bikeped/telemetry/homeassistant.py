@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import msgspec
 
-from bikeped.config.sections import MqttConfig
+from bikeped.config import MqttConfig
 from bikeped.telemetry.messages import ShownState
 
 

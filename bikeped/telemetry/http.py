@@ -13,7 +13,7 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
-from bikeped.config.sections import WebConfig
+from bikeped.config import WebConfig
 from bikeped.telemetry.messages import ShownState
 
 log = logging.getLogger(__name__)

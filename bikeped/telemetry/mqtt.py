@@ -19,7 +19,7 @@ from typing import NamedTuple
 import aiomqtt
 
 from bikeped import __version__
-from bikeped.config.sections import MqttConfig
+from bikeped.config import MqttConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.homeassistant import discovery_messages
 from bikeped.telemetry.mqtt_auth import load_credentials, sends_password_in_clear

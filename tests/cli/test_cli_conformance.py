@@ -299,3 +299,16 @@ def test_group_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     experiments += ["placement", "errors", "reproduce"]
     for name in [*experiments, "gate", "promote", "contest", "register", "plot"]:
         assert f"  {name} " in said
+
+
+def test_run_writes_the_audit_of_every_frame(tmp_path, capsys):
+    target = tmp_path / "audit.jsonl"
+    assert (
+        main(["conformance", "run", "--scenario", "Swerving Cyclist", "--audit", str(target)]) == 0
+    )
+    header, *frames = [json.loads(line) for line in target.read_text().splitlines()]
+    assert header["scenario"] == "Swerving Cyclist"
+    assert header["frames"] == len(frames)
+    assert {"ALERT", "WARNING"} <= {frame["state"] for frame in frames}
+    assert main(["conformance", "run", "--audit", str(tmp_path / "no" / "a.jsonl")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from bikeped.config.sections import FeedbackConfig, GpioConfig, UsbConfig
+from bikeped.config import FeedbackConfig, GpioConfig, UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback import check_light, light_driver, open_light
 from bikeped.feedback.light import LightDriver, SimulatedLight, assign_lamps

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config.sections import FeedbackConfig
+from bikeped.config import FeedbackConfig
 from bikeped.feedback.signal import OFF, STARTING, SignalLogic, assess, fault_signal
 from bikeped.types import Colour, Signal, Sound, State
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bikeped.config.sections import AuditConfig
+from bikeped.config import AuditConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.events import EventWriter

@@ -9,7 +9,7 @@ from typing import get_args
 import msgspec
 import pytest
 
-from bikeped.config.sections import MqttConfig
+from bikeped.config import MqttConfig
 from bikeped.telemetry.homeassistant import discovery_messages, object_id
 from bikeped.telemetry.messages import HealthMessage, ShownState, StageLatency, StateMessage
 

@@ -11,7 +11,7 @@ import pytest
 from aiohttp import web
 from prometheus_client.parser import text_string_to_metric_families
 
-from bikeped.config.sections import WebConfig
+from bikeped.config import WebConfig
 from bikeped.telemetry.http import HttpServer, host_name, is_loopback, make_app
 from bikeped.telemetry.metrics import Metrics
 

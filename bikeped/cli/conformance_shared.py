@@ -1,0 +1,163 @@
+"""What the conformance commands share: options, the suite, tables and JSON."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from bikeped.cli.common import check_json_target, config_options, console, json_option, write_json
+from bikeped.cli.conformance_governance import scenarios_option
+from bikeped.config import LoadedConfig, load_config
+from bikeped.errors import BikepedError
+
+if TYPE_CHECKING:
+    from bikeped.conformance.suite import Suite
+    from bikeped.conformance.tables import Cell, Result, Table
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def suite_options(function: F) -> F:
+    """`-c`, `--set`, `--scenarios`, `--seed` and `--json`, on every experiment."""
+    for option in (
+        json_option,
+        click.option(
+            "--seed",
+            type=click.IntRange(0, 2**32 - 1),
+            help="Seed of everything random; it is told in the JSON. Default: 0; optimize: 42.",
+        ),
+        scenarios_option,
+        config_options,
+    ):
+        function = option(function)
+    return function
+
+
+def trials_option(default: int) -> Callable[[F], F]:
+    """`--trials`."""
+    return click.option(
+        "--trials",
+        type=click.IntRange(1, 100_000),
+        default=default,
+        show_default=True,
+        help="Random repetitions.",
+    )
+
+
+processes_option = click.option(
+    "--processes",
+    type=click.IntRange(1, 256),
+    help="Processes; default: one a core. The figures do not depend on it.",
+)
+curve_option = click.option(
+    "--recall-curve",
+    "curve_path",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Recall over projected area: CSV or JSON of bin centre (square pixels), recall.",
+)
+burst_option = click.option(
+    "--burst",
+    type=click.FloatRange(1, 1000),
+    default=5.0,
+    show_default=True,
+    help="Mean length of a burst of misses, in frames.",
+)
+
+
+def print_table(screen: Console, table: Table) -> None:
+    """A table on a terminal as wide as that is; elsewhere as wide as it needs."""
+    if not screen.is_terminal:
+        screen.width = 250
+    screen.print(rich_table(table))
+
+
+def rich_table(table: Table) -> RichTable:
+    """A table for a terminal: per cent with one decimal, seconds with two."""
+    drawn = RichTable(
+        title=escape(table.title),
+        title_justify="left",
+        caption=escape(table.note) or None,
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+    )
+    for column, name in enumerate(table.columns):
+        is_text = any(isinstance(row[column], str) for row in table.rows)
+        drawn.add_column(escape(name), justify="left" if is_text else "right")
+    for row in table.rows:
+        drawn.add_row(*(cell_text(c, n) for c, n in zip(row, table.columns, strict=True)))
+    return drawn
+
+
+def cell_text(cell: Cell, column: str) -> str:
+    """One figure as the column's name asks for it; a dash where there is none."""
+    if cell is None:
+        return "-"
+    if isinstance(cell, float) and column.endswith("%"):
+        return f"{cell:.1f}"
+    if isinstance(cell, float) and column.endswith(", s"):
+        return f"{cell:.2f}"
+    return f"{cell:g}" if isinstance(cell, float) else escape(str(cell))
+
+
+def begin(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    json_path: str | None,
+) -> tuple[LoadedConfig, Suite]:
+    """Configuration and suite, and every quick check before the work."""
+    from bikeped.conformance.scenario import bundled_folder, load_scenarios
+    from bikeped.conformance.suite import Suite
+
+    check_json_target(json_path)
+    loaded = load_config(config_path, overrides)
+    scenarios = load_scenarios(scenarios_dir or bundled_folder())
+    return loaded, Suite.load(scenarios, loaded)
+
+
+def emit(
+    result: Result, suite: Suite, loaded: LoadedConfig, seed: int, json_path: str | None
+) -> None:
+    """JSON where it is asked for, tables for people unless standard output is JSON's."""
+    if json_path is not None:
+        write_json({**stamp(suite, loaded, seed), **result.data}, json_path)
+    if json_path == "-":
+        return
+    screen = console()
+    for table in result.tables:
+        print_table(screen, table)
+        screen.print()
+
+
+def stamp(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
+    """What every JSON begins with: where its figures come from."""
+    from bikeped.conformance.experiments import provenance
+
+    return provenance(suite, loaded, seed)
+
+
+def optimizer() -> Any:
+    """The optimiser's module; BikepedError where the extra that it needs is not installed."""
+    try:
+        from bikeped.conformance import optimizer
+    except ImportError as error:
+        raise BikepedError(
+            f"{error.name}: not installed; install bikeped[sim] for the optimiser"
+        ) from error
+    return optimizer
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
