@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bikeped.errors import BikepedError
+from bikeped.files import write_whole
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -68,25 +68,6 @@ def write_json(data: Any, target: str) -> None:
         sys.stdout.write(text)
         return
     write_whole(Path(target), text)
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Writes a file under a temporary name and renames it."""
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent or Path())
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise BikepedError(
-            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and that "
-            "you may write"
-        ) from error
 
 
 def console(json_path: str | None = None) -> Console:

@@ -13,7 +13,6 @@ from bikeped.cli.common import (
     console,
     progress_bar,
     write_json,
-    write_whole,
 )
 from bikeped.cli.conformance_governance import add_commands
 from bikeped.cli.conformance_shared import (
@@ -31,6 +30,7 @@ from bikeped.cli.conformance_shared import (
 )
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError
+from bikeped.files import write_whole
 
 if TYPE_CHECKING:
     pass

@@ -16,12 +16,12 @@ from bikeped.cli.common import (
     json_option,
     progress_bar,
     write_json,
-    write_whole,
 )
 from bikeped.cli.governance_tables import count, print_contest, print_gates, print_register
 from bikeped.config import LoadedConfig, load_config
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError, ConfigError
+from bikeped.files import write_whole
 
 if TYPE_CHECKING:
     from bikeped.conformance.suite import Suite

@@ -13,10 +13,9 @@ from bikeped.cli.common import (
     json_option,
     progress_bar,
     write_json,
-    write_whole,
 )
-from bikeped.cli.replay import make_folder
 from bikeped.config import framing, ground_camera, load_config
+from bikeped.files import make_folder, write_whole
 
 
 @click.command("demo")

@@ -18,7 +18,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.config import load_config
-from bikeped.errors import BikepedError
+from bikeped.files import make_folder
 
 if TYPE_CHECKING:
     from bikeped.service.replay import ReplayResult
@@ -76,16 +76,6 @@ def command(
         for path in (overlay, events):
             if path is not None:
                 click.echo(f"wrote {path}")
-
-
-def make_folder(folder: Path) -> None:
-    """Makes an output folder; BikepedError when that cannot be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BikepedError(
-            f"{folder}: cannot be made ({error.strerror}); choose another --out"
-        ) from error
 
 
 def print_result(screen: Console, result: ReplayResult) -> None:

@@ -7,7 +7,6 @@ setting and prints on paper.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path, PurePosixPath
@@ -18,7 +17,7 @@ from bikeped.conformance.figures import FIGURES
 from bikeped.conformance.gates import all_hold, check_figures
 from bikeped.conformance.register import from_figures
 from bikeped.conformance.tables import Cell, Result, Table
-from bikeped.errors import BikepedError
+from bikeped.files import write_whole
 
 #: Without the table of scenarios, the verdict is on the comparison's first of these.
 _JUDGED = ("deployed", "selected")
@@ -95,7 +94,7 @@ def write_index(
         "</body>\n</html>\n"
     )
     path = folder / "index.html"
-    _write(path, page)
+    write_whole(path, page)
     return path
 
 
@@ -303,21 +302,3 @@ def _column(cells: Sequence[Cell]) -> list[str]:
     return [
         "–" if c is None else f"{c:.{decimals}f}" if isinstance(c, float) else str(c) for c in cells
     ]
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        handle, name = tempfile.mkstemp(prefix=".index.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise BikepedError(
-            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and that "
-            "you may write"
-        ) from error

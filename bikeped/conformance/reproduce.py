@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -28,7 +26,7 @@ from bikeped.conformance.perception import RecallModel
 from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.tables import Result, Table
 from bikeped.conformance.workers import workers
-from bikeped.errors import BikepedError
+from bikeped.files import make_folder, write_whole
 
 #: Packages whose source decides what an experiment gives.
 _CODE = ("conformance", "decision", "geometry", "tracking", "config")
@@ -216,7 +214,7 @@ def reproduce(
     """
     data_folder, table_folder = folder / "data", folder / "tables"
     for part in (data_folder, table_folder):
-        _make(part)
+        make_folder(part)
     keys = {name: key_of(name, suite, loaded, settings) for name in EXPERIMENTS}
     found: dict[str, Result] = {}
     seconds: dict[str, float] = {}
@@ -237,7 +235,7 @@ def reproduce(
             "data": result.data,
             "tables": [_table_dict(table) for table in result.tables],
         }
-        write_text(data_folder / f"{name}.json", _json(document))
+        write_whole(data_folder / f"{name}.json", _json(document))
         progress(len(found))
 
     _ = suite.truth_frames, suite.run  # made once, before the suite goes to every process
@@ -274,8 +272,8 @@ def reproduce(
     results = tuple(found[name] for name in SHOWN_ORDER)
     for result in results:
         for table in result.tables:
-            write_text(table_folder / f"{table.name}.csv", table.csv())
-            write_text(table_folder / f"{table.name}.json", _json(_table_dict(table)))
+            write_whole(table_folder / f"{table.name}.csv", table.csv())
+            write_whole(table_folder / f"{table.name}.json", _json(_table_dict(table)))
     drawn = tuple(path for name in SHOWN_ORDER for path in pictures.get(name, []))
     index: Path | None = None
     if figures:
@@ -330,30 +328,3 @@ def _table_dict(table: Table) -> dict[str, Any]:
 
 def _json(document: Mapping[str, Any]) -> str:
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BikepedError(
-            f"{folder}: cannot be made ({error.strerror}); choose another --out"
-        ) from error
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file under a temporary name and renames it: whole or not at all."""
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise BikepedError(
-            f"{path}: cannot be written ({error.strerror}); choose another --out"
-        ) from error

@@ -1,0 +1,38 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from bikeped.errors import BikepedError
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes `text` as UTF-8 under a temporary name and renames it; BikepedError when it cannot."""
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            Path(name).chmod(0o644)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise BikepedError(
+            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and that "
+            "you may write"
+        ) from error
+
+
+def make_folder(folder: Path) -> None:
+    """Makes an output folder and its parents; BikepedError when that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BikepedError(
+            f"{folder}: cannot be made ({error.strerror}); choose another --out"
+        ) from error
