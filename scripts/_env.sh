@@ -28,12 +28,13 @@ ensure_env() {
     say "making .venv with $(find_python)"
     "$(find_python)" -m venv --clear .venv
   fi
-  wanted="$extras $(cksum <pyproject.toml) $(.venv/bin/python -V)"
+  wanted="$extras $(cat pyproject.toml scripts/constraints.txt | cksum) $(.venv/bin/python -V)"
   stamp=.venv/.bikeped-${extras:-base}
   if [ ! -f "$stamp" ] || [ "$(cat "$stamp")" != "$wanted" ]; then
     say "installing bikeped${extras:+[$extras]} into .venv"
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=23.1'
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable "$spec"
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check \
+      --constraint scripts/constraints.txt --editable "$spec"
     printf '%s' "$wanted" >"$stamp"
   fi
 }

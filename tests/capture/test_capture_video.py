@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import itertools
 import logging
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from shared_inputs import CLIP, missing
 
 from bikeped.capture import JpegDecoder, VideoSource, open_source
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT, FPS = 96, 64, 25.0
-SHARED = Path(__file__).parents[2].parent / "shared" / "media" / "person-bicycle-car.mp4"
 
 
 def _all(source):
@@ -111,9 +110,9 @@ def test_two_runs_are_the_same(write_video, name, fourcc):
 
 
 def test_h264_of_the_shared_recording():
-    if not SHARED.exists():
-        pytest.skip("the shared H.264 recording is not beside the repository")
-    with VideoSource(SHARED) as source:
+    if why := missing(CLIP):
+        pytest.skip(why)
+    with VideoSource(CLIP) as source:
         assert (source.width, source.height, source.fps) == (768, 432, 12.0)
         frames = list(itertools.islice(iter(source.read, None), 5))
     assert [frame.captured_s for frame in frames] == pytest.approx([i / 12 for i in range(5)])

@@ -13,19 +13,14 @@ import numpy as np
 import onnx
 import pytest
 from onnx import helper, numpy_helper
+from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.weights import first_layer
 from bikeped.types import Kind
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared"
-MODEL = SHARED / "models" / "yolox_nano.onnx"
-CLIP = SHARED / "media" / "person-bicycle-car.mp4"
-
-pytestmark = pytest.mark.skipif(
-    not (MODEL.is_file() and CLIP.is_file()), reason=f"no model and clip in {SHARED}"
-)
+pytestmark = pytest.mark.skipif(bool(missing(MODEL, CLIP)), reason=missing(MODEL, CLIP))
 
 # A square cut of the picture, as the camera's framing gives it, so that a small network sees the
 # small cyclist nearly at full size.

@@ -11,15 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config import load_config
 from bikeped.service.replay import ReplayFiles, replay
 from bikeped.telemetry.messages import decision_digest
 
 ROOT = Path(__file__).parents[2]
-SHARED = ROOT.parent / "shared"
-MODEL = SHARED / "models" / "yolox_nano.onnx"
-CLIP = SHARED / "media" / "person-bicycle-car.mp4"
 EXAMPLE = ROOT / "docs" / "examples" / "ordinary-video.yaml"
 
 
@@ -27,9 +25,7 @@ def test_the_example_is_a_configuration():
     assert load_config(EXAMPLE).config.camera.projection == "perspective"
 
 
-@pytest.mark.skipif(
-    not (MODEL.is_file() and CLIP.is_file()), reason=f"no model and clip in {SHARED}"
-)
+@pytest.mark.skipif(bool(missing(MODEL, CLIP)), reason=missing(MODEL, CLIP))
 def test_the_clip_has_a_walker_a_bicycle_and_cars_at_plausible_speeds(tmp_path):
     loaded = load_config(EXAMPLE, [f"detection.model={MODEL}", "detection.threads=1"])
     digests = []
