@@ -15,7 +15,6 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -49,18 +48,6 @@ def json_option(command: F) -> F:
     )(command)
 
 
-def check_json_target(target: str | None) -> None:
-    """Raises BikepedError now rather than after minutes of work when `--json` cannot be written."""
-    if target is None or target == "-":
-        return
-    folder = Path(target).parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK) or Path(target).is_dir():
-        raise BikepedError(
-            f"--json {target}: cannot be written; name a file in a folder that exists and that you "
-            "may write"
-        )
-
-
 def write_json(data: Any, target: str) -> None:
     """Writes JSON to a file (whole or not at all) or to standard output."""
     text = json.dumps(data, indent=2, allow_nan=False) + "\n"
@@ -72,7 +59,10 @@ def write_json(data: Any, target: str) -> None:
 
 def console(json_path: str | None = None) -> Console:
     """Where tables for people go: standard output, unless JSON goes there."""
-    return Console(stderr=json_path == "-", highlight=False, soft_wrap=True)
+    screen = Console(stderr=json_path == "-", highlight=False, soft_wrap=True)
+    if not screen.is_terminal:
+        screen.width = 250  # a file or a pipe is as wide as the table needs
+    return screen
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ import click
 import msgspec
 
 from bikeped.cli.common import config_options, json_option, write_json
+from bikeped.cli.guard import guarded
 from bikeped.config import Config, framing, ground_camera, load_config
 from bikeped.errors import ConfigError
 from bikeped.geometry import GroundTable
@@ -22,6 +23,7 @@ def command() -> None:
 @command.command("check")
 @config_options
 @json_option
+@guarded
 def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
     """Say what is wrong with the configuration, or that all is well."""
     from bikeped.feedback import check_light
@@ -60,6 +62,7 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
 @command.command("show")
 @config_options
 @json_option
+@guarded
 def show(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
     """Show the whole effective configuration as YAML."""
     loaded = load_config(config_path, overrides)
@@ -73,6 +76,7 @@ def show(config_path: Path | None, overrides: tuple[str, ...], json_path: str | 
 @command.command("schema")
 @config_options
 @json_option
+@guarded
 def schema(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
     """Show the JSON Schema of the configuration."""
     data = json_schema()

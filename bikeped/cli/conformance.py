@@ -9,7 +9,6 @@ import click
 from rich.markup import escape
 
 from bikeped.cli.common import (
-    check_json_target,
     console,
     progress_bar,
     write_json,
@@ -28,6 +27,7 @@ from bikeped.cli.conformance_shared import (
     suite_options,
     trials_option,
 )
+from bikeped.cli.guard import guarded
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
@@ -53,6 +53,7 @@ add_commands(command)
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write every frame's true and observed positions, state and danger as JSON Lines.",
 )
+@guarded
 def run(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -66,7 +67,7 @@ def run(
     from bikeped.conformance.audit import write_audit
     from bikeped.conformance.experiments import one_scenario, run_table
 
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     if name is not None:
         suite = one_scenario(suite, name)
     if audit_path is not None:
@@ -83,6 +84,7 @@ def run(
     metavar="NAME=FILE.yaml",
     help="A further configuration: the file's decision section. May be repeated.",
 )
+@guarded
 def compare(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -103,13 +105,14 @@ def compare(
         if name in configurations:
             raise BikepedError(f"--configuration {name}: the name is taken; choose another")
         configurations[name] = load_decision(Path(file))
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     result = compare_table(suite, loaded, configurations, seed or 0)
     emit(result, suite, loaded, seed or 0, json_path)
 
 
 @command.command("errors")
 @suite_options
+@guarded
 def errors(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -120,12 +123,13 @@ def errors(
     """How far off the camera puts pedestrians, cyclists and cars, by distance and bearing."""
     from bikeped.conformance.experiments import errors as localisation_errors
 
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     emit(localisation_errors(suite), suite, loaded, seed or 0, json_path)
 
 
 @command.command("truth")
 @suite_options
+@guarded
 def truth(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -137,7 +141,7 @@ def truth(
     from bikeped.conformance.experiments import braking_profiles, truth_sensitivity
     from bikeped.conformance.tables import Result
 
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     decision = loaded.config.decision
     thresholds, braking = truth_sensitivity(suite, decision), braking_profiles(suite, decision)
     data = {**thresholds.data, "braking": braking.data}
@@ -151,6 +155,7 @@ def truth(
 @burst_option
 @curve_option
 @processes_option
+@guarded
 def montecarlo(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -170,7 +175,7 @@ def montecarlo(
     from bikeped.conformance.suite import CONFIGURATIONS
 
     curve = None if curve_path is None else mc.load_recall_curve(curve_path)
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     configurations = dict(CONFIGURATIONS)
     if loaded.config.decision not in configurations.values():
         configurations = {"configured": loaded.config.decision, **configurations}
@@ -191,6 +196,7 @@ def montecarlo(
 @burst_option
 @curve_option
 @processes_option
+@guarded
 def latency(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -211,7 +217,7 @@ def latency(
     if not loss and (bursts or curve_path is not None):
         raise BikepedError("latency: --bursts and --recall-curve belong to --loss; add it")
     curve = None if curve_path is None else mc.load_recall_curve(curve_path)
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     decision = loaded.config.decision
     if not loss:
         result = late.sweep(suite, decision)
@@ -254,6 +260,7 @@ def latency(
     metavar="CANDIDATE.yaml",
     help="Write what was found as a candidate for `gate` and `promote`.",
 )
+@guarded
 def optimize(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -266,9 +273,7 @@ def optimize(
 ) -> None:
     """Search the decision's five parameters by differential evolution."""
     search = optimizer()
-    if out is not None:
-        check_json_target(str(out))
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     chosen = search.SEED if seed is None else seed
     with progress_bar("evaluations", search.evaluations(maxiter, popsize)) as progress:
         result = search.optimize(suite, loaded.config.decision, chosen, maxiter, popsize, progress)
@@ -282,6 +287,7 @@ def optimize(
 @command.command("deployment")
 @suite_options
 @trials_option(200)
+@guarded
 def deployment(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -293,7 +299,7 @@ def deployment(
     """Road widths with one camera and with two."""
     from bikeped.conformance import deployment as roads
 
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     with progress_bar("road widths", len(roads.WIDTHS_FT)) as progress:
         result = roads.deployment(
             suite.camera, loaded.config.decision, trials, seed or 0, progress=progress
@@ -304,6 +310,7 @@ def deployment(
 @command.command("placement")
 @suite_options
 @trials_option(20)
+@guarded
 def placement(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -315,7 +322,7 @@ def placement(
     """Camera height by pitch on a road of 40 ft."""
     from bikeped.conformance import deployment as roads
 
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     with progress_bar("heights", len(roads.HEIGHTS_M)) as progress:
         result = roads.placement(
             suite.camera, loaded.config.decision, trials, seed or 0, progress=progress
@@ -337,6 +344,7 @@ def placement(
 @curve_option
 @processes_option
 @click.option("--no-figures", is_flag=True, help="Only data and tables.")
+@guarded
 def reproduce(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -362,7 +370,7 @@ def reproduce(
 
         require_matplotlib()
     curve = None if curve_path is None else load_recall_curve(curve_path)
-    loaded, suite = begin(config_path, overrides, scenarios_dir, json_path)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
     settings = whole.Settings(trials=trials, seed=seed or 0, burst=burst, curve=curve)
     with progress_bar("experiments", len(whole.EXPERIMENTS) + 1) as progress:
         found = whole.reproduce(

@@ -18,6 +18,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.governance_tables import count, print_contest, print_gates, print_register
+from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, load_config
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError, ConfigError
@@ -51,6 +52,7 @@ def scenarios_option(command: F) -> F:
 @config_options
 @scenarios_option
 @json_option
+@guarded
 def gate(
     candidate: Path,
     config_path: Path | None,
@@ -101,6 +103,7 @@ def gate(
     help="The optimiser's trace file that the candidate came from; its hash is kept.",
 )
 @json_option
+@guarded
 def promote(
     candidate: Path,
     config_path: Path | None,
@@ -172,6 +175,7 @@ def promote(
     help="A tighter bound: a decision parameter outside it is moved to its nearest end.",
 )
 @json_option
+@guarded
 def contest(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -224,6 +228,7 @@ def contest(
     help="Write the register as Markdown.",
 )
 @json_option
+@guarded
 def register(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -256,6 +261,7 @@ def register(
     help="Folder for the pictures; it is made.",
 )
 @json_option
+@guarded
 def plot(
     config_path: Path | None,
     overrides: tuple[str, ...],

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from bikeped.cli.common import check_json_target, config_options, console, json_option, write_json
+from bikeped.cli.common import config_options, console, json_option, write_json
 from bikeped.cli.conformance_governance import scenarios_option
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
@@ -73,9 +73,7 @@ burst_option = click.option(
 
 
 def print_table(screen: Console, table: Table) -> None:
-    """A table on a terminal as wide as that is; elsewhere as wide as it needs."""
-    if not screen.is_terminal:
-        screen.width = 250
+    """A table for people."""
     screen.print(rich_table(table))
 
 
@@ -112,13 +110,11 @@ def begin(
     config_path: Path | None,
     overrides: tuple[str, ...],
     scenarios_dir: Path | None,
-    json_path: str | None,
 ) -> tuple[LoadedConfig, Suite]:
     """Configuration and suite, and every quick check before the work."""
     from bikeped.conformance.scenario import bundled_folder, load_scenarios
     from bikeped.conformance.suite import Suite
 
-    check_json_target(json_path)
     loaded = load_config(config_path, overrides)
     scenarios = load_scenarios(scenarios_dir or bundled_folder())
     return loaded, Suite.load(scenarios, loaded)

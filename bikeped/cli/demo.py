@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import click
 
 from bikeped.cli.common import (
-    check_json_target,
     config_options,
     json_option,
     progress_bar,
     write_json,
 )
+from bikeped.cli.guard import guarded
 from bikeped.config import framing, ground_camera, load_config
+from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
 
 
@@ -33,6 +35,7 @@ from bikeped.files import make_folder, write_whole
     help="Only the beginning: so many seconds of the crossing.",
 )
 @json_option
+@guarded
 def command(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -53,7 +56,8 @@ def command(
     from bikeped.service.drawn import DrawnEye
     from bikeped.service.replay import ReplayFiles, replay
 
-    check_json_target(json_path)
+    if seconds is not None and not math.isfinite(seconds):
+        raise BikepedError(f"--seconds {seconds}: is not a number of seconds; give e.g. 5")
     loaded = load_config(config_path, overrides)
     make_folder(out)
     scenario = load_scenario(bundled_scenario())

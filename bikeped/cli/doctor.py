@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import click
 from rich.table import Table
 
-from bikeped.cli.common import check_json_target, config_options, console, json_option, write_json
+from bikeped.cli.common import config_options, console, json_option, write_json
+from bikeped.cli.guard import guarded
 from bikeped.config import default_config_path, load_config
 from bikeped.errors import BikepedError
 
@@ -24,6 +25,7 @@ _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skipped": "dim"
 @click.option("--no-light", is_flag=True, help="Do not touch the lamps: they speak to the street.")
 @click.option("--no-sound", is_flag=True, help="Do not play the chime.")
 @json_option
+@guarded
 def command(
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -34,7 +36,6 @@ def command(
     """Check camera, model, light, speaker, broker, clock and disk; 1 when one of them fails."""
     from bikeped.service.doctor import Finding, checks, examine
 
-    check_json_target(json_path)
     file = config_path or default_config_path()
     findings: list[Finding] = []
     try:

@@ -62,9 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
             click.echo(context.get_help(), err=True)
             return 2
         command = context.command_path if context is not None else "bikeped"
-        click.echo(
-            f"bikeped: {' '.join(error.format_message().split())}; see {command} --help", err=True
-        )
+        text = " ".join(error.format_message().split()).rstrip(".")
+        click.echo(f"bikeped: {text}; see {command} --help", err=True)
         return 2
     except click.exceptions.Exit as leave:
         return leave.exit_code

@@ -10,13 +10,13 @@ from rich.console import Console
 from rich.table import Table
 
 from bikeped.cli.common import (
-    check_json_target,
     config_options,
     console,
     json_option,
     progress_bar,
     write_json,
 )
+from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config import load_config
 from bikeped.files import make_folder
 
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 @click.option("--no-mqtt", is_flag=True, help="Publish nothing, whatever the configuration says.")
 @click.option("--realtime", is_flag=True, help="At the recording's own pace.")
 @json_option
+@guarded
 def command(
     video: str,
     config_path: Path | None,
@@ -47,16 +48,17 @@ def command(
     no_mqtt: bool,
     realtime: bool,
     json_path: str | None,
-) -> None:
+) -> int:
     """Run VIDEO (a file or a folder of pictures) through the loop and say what it decided."""
     from bikeped.service.replay import ReplayFiles, replay
 
-    check_json_target(json_path)
     loaded = load_config(config_path, overrides)
     if out is not None:
         make_folder(out)
         overlay = overlay or out / "overlay.mp4"
         events = events or out / "events.jsonl"
+        names = (("--overlay", overlay), ("--events", events), ("--out", out / "summary.json"))
+        check_outputs([("VIDEO", Path(video))], names)
     with progress_bar("replay", None) as progress:
         result = replay(
             loaded,
@@ -73,9 +75,21 @@ def command(
         write_json(summary, json_path)
     if json_path != "-":
         print_result(console(), result)
-        for path in (overlay, events):
+        for path in (overlay, events, None if out is None else out / "summary.json"):
             if path is not None:
                 click.echo(f"wrote {path}")
+    if result.interrupted:
+        click.echo(
+            f"bikeped: interrupted after {result.frames} frames; what was written ends there",
+            err=True,
+        )
+        return 130
+    return 0
+
+
+def counted(number: int, what: str) -> str:
+    """`1 frame`, `2 frames`."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def print_result(screen: Console, result: ReplayResult) -> None:
@@ -86,14 +100,16 @@ def print_result(screen: Console, result: ReplayResult) -> None:
         f"{data['frames_per_second']:.1f} frames/s; detector: {data['detector']}"
     )
     if data["undecodable"]:
-        screen.print(f"{data['undecodable']} frames did not decode and were skipped")
+        screen.print(f"{counted(data['undecodable'], 'frame')} did not decode and were skipped")
     found = ", ".join(f"{count} {kind}" for kind, count in data["tracks"].items()) or "none"
     screen.print(f"tracks: {found}")
     total = max(1, sum(data["states"].values()))
-    shares = ", ".join(f"{s} {n / total:.0%}" for s, n in data["states"].items())
+    shares = ", ".join(f"{s} {n / total:.1%}" for s, n in data["states"].items())
     screen.print(f"states: {shares}")
     for alert in data["alerts"]:
-        screen.print(f"  {alert['t']:7.2f} s  {alert['sentence']} ({alert['frames']} frames)")
+        screen.print(
+            f"  {alert['t']:7.2f} s  {alert['sentence']} ({counted(alert['frames'], 'frame')})"
+        )
     table = Table(title="latency, ms", title_justify="left", box=None, pad_edge=False)
     table.add_column("stage")
     for name in ("mean", "p50", "p95", "p99", "max"):

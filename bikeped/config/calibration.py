@@ -1,4 +1,4 @@
-"""`camera_calibration.json`: the lens as `bikeped calibrate` measured it."""
+"""`camera_calibration.json`: the lens as it was measured."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def load_calibration(path: Path) -> tuple[Calibration, str]:
         data = path.read_bytes()
     except OSError as error:
         raise CalibrationError(
-            f"{path}: cannot be read ({error.strerror}); correct camera.calibration, or make the "
-            "file with bikeped calibrate"
+            f"{path}: cannot be read ({error.strerror}); correct camera.calibration, or set it "
+            "to null and give camera.radius_px and camera.fov_deg"
         ) from error
     try:
         calibration = msgspec.json.decode(data, type=Calibration)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise CalibrationError(
-            f"{path}: {error}; make the file anew with bikeped calibrate"
+            f"{path}: {error}; compare it with the camera_calibration.json that comes with bikeped"
         ) from error
     return calibration, hashlib.sha256(data).hexdigest()

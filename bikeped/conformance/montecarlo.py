@@ -219,10 +219,11 @@ def _parts(trials: int) -> int:
     return min(trials, max(8, trials // 50))
 
 
-def summary(values: Iterable[float]) -> dict[str, float | int | None]:
+def summary(values: Iterable[float], most: float = float("inf")) -> dict[str, float | int | None]:
     """Mean over trials with its 95 % confidence interval (Student), and the trials' own spread.
 
-    Trials without the figure (NaN) are left out; null without any, no interval from one alone.
+    No figure lies below 0 or above `most` (1 for a share), so the interval ends there. Trials
+    without the figure (NaN) are left out; null without any, no interval from one alone.
     """
     known = np.asarray([v for v in values if np.isfinite(v)], np.float64)
     count = len(known)
@@ -234,13 +235,23 @@ def summary(values: Iterable[float]) -> dict[str, float | int | None]:
     half = None if sd is None else _student(count - 1) * sd / float(np.sqrt(count))
     return {
         "mean": float(mean),
-        "low": None if half is None else float(mean - half),
-        "high": None if half is None else float(mean + half),
+        "low": None if half is None else max(0.0, float(mean - half)),
+        "high": None if half is None else min(most, float(mean + half)),
         "sd": sd,
         "p2_5": float(low_share),
         "p97_5": float(high_share),
         "trials": count,
     }
+
+
+#: Figures that are shares of something, at most 1.
+_SHARES = frozenset(
+    {"sensitivity", "specificity", "contact_sensitivity", "sev_fn", "fatigue", "adequate_share"}
+)
+
+
+def _most(figure: str) -> float:
+    return 1.0 if figure in _SHARES else float("inf")
 
 
 def _student(freedom: int) -> float:
@@ -255,13 +266,13 @@ def _student(freedom: int) -> float:
 def summaries(metrics: Sequence[Metrics]) -> dict[str, Any]:
     """`summary` of every figure of a metrics dictionary over trials."""
     rows = [m.as_dict() for m in metrics]
-    return {key: summary(_real(row[key]) for row in rows) for key in rows[0]}
+    return {key: summary((_real(row[key]) for row in rows), _most(key)) for key in rows[0]}
 
 
 def scenario_summaries(metrics: Sequence[Metrics], index: int) -> dict[str, Any]:
     """The same of one scenario's figures."""
     rows = [m.scenario_dict(index) for m in metrics]
-    return {key: summary(_real(row[key]) for row in rows) for key in rows[0]}
+    return {key: summary((_real(row[key]) for row in rows), _most(key)) for key in rows[0]}
 
 
 def _real(value: float | None) -> float:

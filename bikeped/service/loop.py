@@ -120,6 +120,11 @@ class Loop:
         """Ends `run`; callable from a signal handler."""
         self._stop.set()
 
+    @property
+    def stopping(self) -> bool:
+        """Whether `stop` was called."""
+        return self._stop.is_set()
+
     def dropped(self) -> int:
         """Frames replaced by a newer one before anybody looked."""
         return self._feed.dropped()

@@ -56,6 +56,7 @@ class ReplayResult:
     wall_s: float
     config_hash: str
     detector: str
+    interrupted: bool = False  #: stopped by a signal: all figures cover only what came before
     warnings: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
@@ -63,6 +64,7 @@ class ReplayResult:
         tally = self.tally
         return {
             "frames": self.frames,
+            "interrupted": self.interrupted,
             "undecodable": self.undecodable,
             "duration_s": round(tally.last_s - (tally.first_s or 0.0), 3),
             "states": dict(sorted(tally.states.items())),
@@ -170,6 +172,9 @@ async def _replay(
                 telemetry, loop, lambda: telemetry.health(loop, part), config.mqtt.health_interval_s
             )
         )
+        # Only now, when nothing more can be refused: an error is one line on its own.
+        for text in warnings:
+            log.warning("%s", text)
         began = time.perf_counter()
         try:
             with _stop_on_signals(loop):
@@ -193,6 +198,7 @@ async def _replay(
         config_hash=loaded.hash,
         detector=eye.name,
         warnings=tuple(warnings),
+        interrupted=loop.stopping,
     )
 
 
@@ -205,7 +211,6 @@ def _size_warnings(loaded: LoadedConfig, source: FrameSource) -> list[str]:
         f"{loaded.source}'s {camera.width} x {camera.height}; were they made by another camera, "
         "set camera.width, camera.height and its lens"
     )
-    log.warning("%s", text)
     return [text]
 
 

@@ -1,0 +1,91 @@
+"""No command may write over what it reads, or write two things into one file."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from bikeped.errors import BikepedError
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+#: Parameters of commands that name what is read, and what is written, and how people know them.
+_INPUTS = {
+    "video": "VIDEO",
+    "config_path": "-c",
+    "candidate": "CANDIDATE",
+    "scenarios_dir": "--scenarios",
+    "added": "--scenario",
+    "trace": "--trace",
+    "curve_path": "--recall-curve",
+}
+_OUTPUTS = {
+    "json_path": "--json",
+    "overlay": "--overlay",
+    "events": "--events",
+    "audit_path": "--audit",
+    "out": "--out",
+}
+
+
+def guarded(command: F) -> F:
+    """Checks the command's files before it starts; sits right above the function.
+
+    Raises BikepedError when an output is an input (or lies in an input folder and exists), when two
+    outputs are one file, and when an output cannot be written.
+    """
+
+    @functools.wraps(command)
+    def checked(**given: Any) -> Any:
+        check_outputs(
+            [(_INPUTS[k], p) for k in _INPUTS if k in given for p in _paths(given[k])],
+            [(_OUTPUTS[k], p) for k in _OUTPUTS if k in given for p in _paths(given[k])],
+        )
+        return command(**given)
+
+    return checked  # type: ignore[return-value]
+
+
+def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[str, Path]]) -> None:
+    """See `guarded`; each is how the command line names it, and the path."""
+    read = [(name, path, path.resolve()) for name, path in inputs if path.exists()]
+    written: dict[Path, str] = {}
+    for name, path in outputs:
+        target = path.resolve()
+        if name == "--out" and (path.is_dir() or not path.suffix):
+            continue  # a folder: what goes into it has names of its own
+        for what, source, real in read:
+            if target == real or (path.exists() and path.samefile(source)):
+                raise BikepedError(
+                    f"{name} {path}: is {what}, which would be overwritten; choose another name"
+                )
+            if real.is_dir() and target.parent == real and path.exists():
+                raise BikepedError(
+                    f"{name} {path}: lies in {what} {source} and would overwrite what is read from "
+                    "there; choose another folder"
+                )
+        if target in written:
+            raise BikepedError(
+                f"{name} {path}: is {written[target]}, too; give each output its own file"
+            )
+        written[target] = name
+        folder = target.parent
+        if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+            raise BikepedError(
+                f"{name} {path}: cannot be written; name a file in a folder that exists and that "
+                "you may write"
+            )
+
+
+def _paths(value: Any) -> list[Path]:
+    """The paths of a parameter: none, one, or several; `-` is standard output."""
+    if value is None or value == "-":
+        return []
+    if isinstance(value, (tuple, list)):
+        return [path for item in value for path in _paths(item)]
+    # --configuration NAME=FILE
+    text = str(value)
+    return [Path(text.partition("=")[2] if "=" in text and not Path(text).exists() else text)]
