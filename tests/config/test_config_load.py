@@ -465,7 +465,7 @@ def test_a_calibration_that_does_not_fit_is_refused(tmp_path, key, value, part):
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff\xfe", b'{"model": "\\ud800"}', b"NaN"])
 def test_a_calibration_that_is_none(tmp_path, data):
     (tmp_path / "lens.json").write_bytes(data)
-    with pytest.raises(CalibrationError, match=r"lens\.json: .*bikeped calibrate"):
+    with pytest.raises(CalibrationError, match=r"lens\.json: .*camera_calibration\.json"):
         load_calibration(tmp_path / "lens.json")
 
 
