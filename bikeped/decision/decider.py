@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from bikeped.decision.rows import CYCLIST, PEDESTRIAN, IndexArray, TrackRows, pair_rows
+from bikeped.decision.rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
 from bikeped.decision.rules import PairVerdicts, RuleSettings, judge
 from bikeped.decision.stages import remembered, resolve
 from bikeped.types import (
@@ -27,15 +27,14 @@ class Decider:
 
     def __init__(self, settings: RuleSettings) -> None:
         self.settings = settings
-        self._rows = _NO_ROWS
-        self._starts: list[tuple[float, int]] = []  #: time and first row of each frame held
+        self._buffer = RowBuffer(max(settings.lookback_s, settings.speed_window_s))
         self._last_cyclist_s = -math.inf
-        self._span_s = max(settings.lookback_s, settings.speed_window_s)
 
     def step(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> Decision:
         """The decision at `time_s`; `ids` [n] ascending, `kind` [n], `xy_m` [n, 2]."""
-        self._append(time_s, ids, kind, xy_m)
-        verdicts, pair_ids = _judge_newest(self._rows, len(self._starts), self.settings)
+        rows, newest = self._buffer.append(time_s, ids, kind, xy_m)
+        pairs = pair_rows(rows, self._buffer.frames, newest)
+        verdicts = judge(rows, pairs, self.settings)
         if (kind == CYCLIST).any():
             self._last_cyclist_s = time_s
         pedestrians = int((kind == PEDESTRIAN).sum())
@@ -52,64 +51,18 @@ class Decider:
                 )[0]
             )
         )
-        pair = _chosen(state, verdicts, pair_ids, self.settings)
+        pair = _chosen(state, rows, pairs, verdicts, self.settings)
         since = time_s - self._last_cyclist_s
         return Decision(
             time_s, state, explain(state, pair, pedestrians, since, self.settings), pair
         )
 
-    def _append(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> None:
-        """Adds the newest frame's rows and drops frames older than the rules look back."""
-        starts, rows = self._starts, self._rows
-        if starts and time_s <= starts[-1][0]:
-            raise ValueError(f"time_s: {time_s} is not after the last frame's {starts[-1][0]}")
-        # One frame beyond the span is kept: the older neighbour of an interpolation.
-        drop = 0
-        while drop + 2 < len(starts) and starts[drop + 1][0] < time_s - self._span_s - 1e-6:
-            drop += 1
-        cut = starts[drop][1] if drop else 0
-        held, last = len(rows) - cut, (starts[-1][1] if starts else 0)
-        previous: IndexArray = np.full(len(ids), -1, np.intp)
-        before = rows.id[last:]
-        if len(ids) and len(before):
-            place = np.minimum(np.searchsorted(before, ids), len(before) - 1)
-            previous = np.where(before[place] == ids, place + (last - cut), -1)
-        self._starts = [(t, row - cut) for t, row in starts[drop:]] + [(time_s, held)]
-        self._rows = TrackRows(
-            frame=np.concatenate(
-                [rows.frame[cut:] - drop, np.full(len(ids), len(self._starts) - 1, np.intp)]
-            ),
-            time_s=np.concatenate([rows.time_s[cut:], np.full(len(ids), time_s)]),
-            id=np.concatenate([rows.id[cut:], ids]),
-            kind=np.concatenate([rows.kind[cut:], kind]),
-            xy_m=np.concatenate([rows.xy_m[cut:], xy_m]),
-            previous=np.concatenate([np.maximum(rows.previous[cut:] - cut, -1), previous]),
-        )
-
-
-_NO_ROWS = TrackRows(
-    frame=np.zeros(0, np.intp),
-    time_s=np.zeros(0),
-    id=np.zeros(0, np.int64),
-    kind=np.zeros(0, np.int8),
-    xy_m=np.zeros((0, 2)),
-    previous=np.zeros(0, np.intp),
-)
-
-
-def _judge_newest(
-    rows: TrackRows, frames: int, settings: RuleSettings
-) -> tuple[PairVerdicts, IntArray]:
-    pairs = pair_rows(rows, frames, frames - 1)
-    verdicts = judge(rows, pairs, settings)
-    ids = np.stack([rows.id[pairs.cyclist_row[pairs.cyclist]], rows.id[pairs.pedestrian_row]], 1)
-    return verdicts, ids
-
 
 def _chosen(
     state: State,
+    rows: TrackRows,
+    pairs: Pairs,
     verdicts: PairVerdicts,
-    ids: IntArray,
     settings: RuleSettings,
 ) -> PairNumbers | None:
     """The first pair in track order that fired (ALERT), or the nearest pair (WARNING)."""
@@ -120,8 +73,8 @@ def _chosen(
     else:
         return None
     return PairNumbers(
-        cyclist_id=int(ids[index][0]),
-        pedestrian_id=int(ids[index][1]),
+        cyclist_id=int(rows.id[pairs.cyclist_row[pairs.cyclist[index]]]),
+        pedestrian_id=int(rows.id[pairs.pedestrian_row[index]]),
         distance_m=float(verdicts.distance_m[index]),
         distance_then_m=float(verdicts.distance_then_m[index]),
         lookback_s=float(verdicts.lookback_s[index]),

@@ -154,36 +154,43 @@ def _look_back(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Both agents' positions [m, 2] `lookback_s` ago (or as far back as both go), and how long."""
     now = rows.time_s[cyclist]
-    target = now - lookback_s
+    target = now - (lookback_s - EPSILON_S)
     c_old, p_old = cyclist, pedestrian
     c_new, p_new = cyclist, pedestrian
     while True:
+        late = rows.time_s[c_old] > target
+        if not np.count_nonzero(late):
+            break
         c_prev, p_prev = rows.previous[c_old], rows.previous[p_old]
-        go = (c_prev >= 0) & (p_prev >= 0) & (rows.time_s[c_old] > target + EPSILON_S)
+        go = late & (c_prev >= 0) & (p_prev >= 0)
         if not np.count_nonzero(go):
             break
         c_new, p_new = np.where(go, c_old, c_new), np.where(go, p_old, p_new)
         c_old, p_old = np.where(go, c_prev, c_old), np.where(go, p_prev, p_old)
     c_then, p_then = rows.xy_m[c_old], rows.xy_m[p_old]
     old_s = rows.time_s[c_old]
-    overshoot = target - old_s
+    overshoot = now - lookback_s - old_s
     between = overshoot > EPSILON_S
     if np.count_nonzero(between):
         gap = np.where(between, rows.time_s[c_new] - old_s, 1.0)
         part = np.where(between, overshoot / gap, 0.0)[:, None]
         c_then = c_then + part * (rows.xy_m[c_new] - c_then)
         p_then = p_then + part * (rows.xy_m[p_new] - p_then)
-        old_s = np.where(between, target, old_s)
+        old_s = np.where(between, now - lookback_s, old_s)
     return c_then, p_then, now - old_s
 
 
 def _speed(rows: TrackRows, row: IndexArray, window_s: float) -> FloatArray:
     """Speed [n] over the last positions that span `window_s`, or over those that there are."""
     now = rows.time_s[row]
+    target = now - (window_s - EPSILON_S)
     old = row
     while True:
+        late = rows.time_s[old] > target
+        if not np.count_nonzero(late):
+            break
         previous = rows.previous[old]
-        go = (previous >= 0) & (rows.time_s[old] > now - window_s + EPSILON_S)
+        go = late & (previous >= 0)
         if not np.count_nonzero(go):
             break
         old = np.where(go, previous, old)

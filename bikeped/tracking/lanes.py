@@ -103,9 +103,7 @@ class LaneTracker:
             self.alive &= time_s - self.seen_s <= (
                 self.settings.max_unseen_s + 1.5 * self.settings.frame_s
             )
-        self.xy_m = np.where(
-            self.alive[..., None], self.xy_m + self.velocity_mps * step_s, self.xy_m
-        )
+        self.xy_m += self.velocity_mps * step_s  # rubbish in free slots moves along, unread
         matched, refused = self._match(xy_m, kind)
         self.detection = matched
         self._correct(time_s, xy_m, kind, matched)
@@ -209,9 +207,11 @@ class LaneTracker:
         kept = keep[:, None]
         new_v = old_v * kept + raw_v * (1 - kept)
         if self._gated:
-            speed = np.hypot(new_v[:, 0], new_v[:, 1])
             most = self._max_speed[self.kind.ravel()[flat]]
-            new_v *= np.minimum(1.0, most / np.maximum(speed, 1e-9))[:, None]
+            over = (new_v * new_v).sum(1) > most * most
+            if np.count_nonzero(over):
+                speed = np.hypot(new_v[over, 0], new_v[over, 1])
+                new_v[over] *= (most[over] / speed)[:, None]
         raw_a = (new_v - old_v) / elapsed[:, None]
         velocity[flat] = new_v
         acceleration[flat] = old_a * kept + raw_a * (1 - kept)
@@ -225,6 +225,8 @@ class LaneTracker:
     def _settle_kind(self, flat: IndexArray, seen: KindArray) -> None:
         """Lets the kind of pedestrians and cyclists follow what they were lately seen as."""
         share, kind = self._cycle_share.reshape(-1), self.kind.reshape(-1)
+        if not np.count_nonzero(share[flat] != (seen == _CYCLIST)):
+            return  # seen as they were always seen
         share[flat] += _CYCLE_WEIGHT * ((seen == _CYCLIST) - share[flat])
         was = kind[flat]
         kind[flat] = np.where((was == _PEDESTRIAN) & (share[flat] > _CYCLE_ON), _CYCLIST, was)

@@ -68,18 +68,18 @@ class Tracker:
     def _remember(self, ids: list[int], xy: FloatArray, time_s: float) -> FloatArray:
         known = self._paths
         self._paths = {}
-        velocity = np.zeros((len(ids), 2))
+        velocity = []
         target = time_s - self._speed_window_s + _EPSILON_S
-        for row, (key, (x, y)) in enumerate(zip(ids, xy.tolist(), strict=True)):
+        for key, (x, y) in zip(ids, xy.tolist(), strict=True):
             path = known.get(key)
             if path is None:
                 path = deque(maxlen=self._history_length)
-            for then, px, py in reversed(path):
-                elapsed = time_s - then
-                if elapsed > 0:
-                    velocity[row] = (x - px) / elapsed, (y - py) / elapsed
+            then, px, py = time_s, x, y
+            for then, px, py in reversed(path):  # noqa: B007  the last one looked at is used below
                 if then <= target:
                     break
+            elapsed = time_s - then
+            velocity.append(((x - px) / elapsed, (y - py) / elapsed) if elapsed > 0 else (0.0, 0.0))
             path.append((time_s, x, y))
             self._paths[key] = path
-        return velocity
+        return np.asarray(velocity, np.float64).reshape(-1, 2)

@@ -112,9 +112,10 @@ def test_times_must_increase():
 
 def test_only_a_moment_of_the_past_is_held():
     decider = Decider(SELECTED)
-    for i in range(500):
+    for i in range(5000):
         step(decider, i / 30, {1: (PEDESTRIAN, 0.0, 0.0)})
-    assert len(decider._rows) <= 6
+    assert len(decider._buffer._frame) <= 512
+    assert decider._buffer.frames <= 512
 
 
 # ---- sentences
