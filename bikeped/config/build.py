@@ -37,8 +37,10 @@ def rule_settings(decision: DecisionConfig) -> RuleSettings:
     )
 
 
-def tracker_settings(tracking: TrackingConfig, nominal_fps: float = 30.0) -> TrackerSettings:
-    """The tracker's parameters."""
+def tracker_settings(
+    tracking: TrackingConfig, nominal_fps: float = 30.0, acceleration: bool = False
+) -> TrackerSettings:
+    """The tracker's parameters; `acceleration` for second-order prediction."""
     return TrackerSettings(
         match_radius_m=tracking.match_radius_m,
         max_unseen_s=tracking.max_unseen_s,
@@ -52,6 +54,7 @@ def tracker_settings(tracking: TrackingConfig, nominal_fps: float = 30.0) -> Tra
         ),
         position_noise_m=tracking.position_noise_m,
         unbiased=True,
+        acceleration=acceleration,
         max_range_m=tracking.max_range_m,
         rider_radius_m=tracking.rider_radius_m,
     )

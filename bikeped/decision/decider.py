@@ -35,27 +35,20 @@ class Decider:
         rows, newest = self._buffer.append(time_s, ids, kind, xy_m)
         pairs = pair_rows(rows, self._buffer.frames, newest)
         verdicts = judge(rows, pairs, self.settings)
-        if (kind == CYCLIST).any():
+        if np.count_nonzero(kind == CYCLIST):
             self._last_cyclist_s = time_s
-        pedestrians = int((kind == PEDESTRIAN).sum())
-        state = State(
-            int(
-                resolve(
-                    np.asarray([pedestrians > 0]),
-                    remembered(
-                        np.asarray([time_s]),
-                        np.asarray([self._last_cyclist_s]),
-                        self.settings.memory_s,
-                    ),
-                    np.asarray([bool(verdicts.fires.any())]),
-                )[0]
-            )
+        pedestrians = np.count_nonzero(kind == PEDESTRIAN)
+        code = resolve(
+            np.asarray([pedestrians > 0]),
+            remembered(
+                np.asarray([time_s]), np.asarray([self._last_cyclist_s]), self.settings.memory_s
+            ),
+            np.asarray([np.count_nonzero(verdicts.fires) > 0]),
         )
+        state = State(code.item())
         pair = _chosen(state, rows, pairs, verdicts, self.settings)
-        since = time_s - self._last_cyclist_s
-        return Decision(
-            time_s, state, explain(state, pair, pedestrians, since, self.settings), pair
-        )
+        sentence = explain(state, pair, pedestrians, time_s - self._last_cyclist_s, self.settings)
+        return Decision(time_s, state, sentence, pair)
 
 
 def _chosen(

@@ -10,6 +10,8 @@ from bikeped.types import BoolArray, FloatArray, State
 
 _EPSILON_S = 1e-6
 _IDLE, _SAFE, _WARNING, _ALERT = (int(s) for s in State)
+#: State by 4 * pedestrian present + 2 * cyclist remembered + approaching.
+_STATES = np.asarray([_IDLE, _IDLE, _IDLE, _IDLE, _SAFE, _SAFE, _WARNING, _ALERT], np.int8)
 
 
 def resolve(
@@ -17,9 +19,8 @@ def resolve(
 ) -> npt.NDArray[np.int8]:
     """State codes [n]: IDLE without a pedestrian, SAFE without a remembered cyclist, else ALERT or
     WARNING by the closing check."""
-    state = np.where(approaching, _ALERT, _WARNING)
-    state = np.where(cyclist_remembered, state, _SAFE)
-    return np.where(pedestrian_present, state, _IDLE).astype(np.int8)
+    stage = pedestrian_present * np.int8(4) + cyclist_remembered * np.int8(2) + approaching
+    return np.asarray(_STATES[stage])
 
 
 def remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:

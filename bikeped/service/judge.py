@@ -51,7 +51,9 @@ class Judge:
         self.table = GroundTable(
             self.camera, *self.sensor_framing.crop_wh, step_px=config.camera.table_step_px
         )
-        self._tracker_settings = tracker_settings(config.tracking, fps)
+        self._tracker_settings = tracker_settings(
+            config.tracking, fps, acceleration=config.latency.order == 2
+        )
         self._speed_window_s = config.tracking.speed_window_frames / fps
         self._history = config.tracking.history_frames
         self._max_range_m = config.tracking.max_range_m

@@ -42,7 +42,8 @@ class TrackerSettings:
     `rider_radius_m`: detectors see a small bicycle in some frames and only its rider in others. A
     person without a track, this near to a cyclist's track without a detection, is that cyclist (and
     the reverse), so that one rider does not become a cyclist and a pedestrian who meet. 0: never,
-    as in the paper's simulation, whose agents have one kind.
+    as in the paper's simulation, whose agents have one kind. `acceleration`: whether it is
+    estimated; only second-order prediction reads it.
     """
 
     match_radius_m: float = 3.0
@@ -55,6 +56,7 @@ class TrackerSettings:
     unbiased: bool = False
     max_range_m: float = math.inf
     rider_radius_m: float = 0.0
+    acceleration: bool = True
 
 
 class LaneTracker:
@@ -200,7 +202,7 @@ class LaneTracker:
         new_xy = xy_m.reshape(-1, 2)[place]
         elapsed = np.maximum(time_s - seen_s[flat], _EPSILON_S)
         keep = (1 - self.settings.velocity_weight) ** (elapsed / self.settings.frame_s)
-        old_v, old_a = velocity[flat], acceleration[flat]
+        old_v = velocity[flat]
         raw_v = (new_xy - seen_xy[flat]) / elapsed[:, None]
         if self.settings.unbiased:
             keep = np.where(hits[flat] == 1, 0.0, keep)
@@ -212,9 +214,10 @@ class LaneTracker:
             if np.count_nonzero(over):
                 speed = np.hypot(new_v[over, 0], new_v[over, 1])
                 new_v[over] *= (most[over] / speed)[:, None]
-        raw_a = (new_v - old_v) / elapsed[:, None]
         velocity[flat] = new_v
-        acceleration[flat] = old_a * kept + raw_a * (1 - kept)
+        if self.settings.acceleration:
+            raw_a = (new_v - old_v) / elapsed[:, None]
+            acceleration[flat] = acceleration[flat] * kept + raw_a * (1 - kept)
         self.xy_m.reshape(-1, 2)[flat] = new_xy
         seen_xy[flat] = new_xy
         seen_s[flat] = time_s

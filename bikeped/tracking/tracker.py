@@ -37,11 +37,11 @@ class Tracker:
         lanes = self.lanes
         lanes.update(time_s, points.xy_m[None], points.kind[None])
         slot = lanes.reported[0].nonzero()[0]
-        slot = slot[lanes.id[0, slot].argsort(kind="stable")]
-        ids = lanes.id[0, slot]
-        xy = lanes.xy_m[0, slot]
+        slot = slot[lanes.id[0][slot].argsort(kind="stable")]
+        ids = lanes.id[0][slot]
+        xy = lanes.xy_m[0][slot]
         velocity = self._remember(ids.tolist(), xy, time_s)
-        matched = lanes.detection[0, slot]
+        matched = lanes.detection[0][slot]
         detection = np.full(len(slot), -1, np.int64)
         hit = matched >= 0
         detection[hit] = points.detection[matched[hit]]
@@ -49,17 +49,17 @@ class Tracker:
         return Tracks(
             time_s=time_s,
             id=ids,
-            kind=lanes.kind[0, slot],
+            kind=lanes.kind[0][slot],
             xy_m=xy,
             velocity_mps=velocity,
-            unseen_s=np.maximum(time_s - lanes.seen_s[0, slot], 0.0),
+            unseen_s=np.maximum(time_s - lanes.seen_s[0][slot], 0.0),
             detection=detection,
         )
 
     def smoothed(self) -> tuple[FloatArray, FloatArray]:
         """Smoothed velocity and acceleration [n, 2] of the tracks of the last update."""
         slot = self._slot
-        return self.lanes.velocity_mps[0, slot], self.lanes.acceleration_mps2[0, slot]
+        return self.lanes.velocity_mps[0][slot], self.lanes.acceleration_mps2[0][slot]
 
     def history(self) -> Mapping[int, list[list[float]]]:
         """Positions [x, y] of every present track, oldest first."""
