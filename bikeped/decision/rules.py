@@ -98,23 +98,19 @@ def judge(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairVerdicts
         settings, distance[index], c_now[index], p_now[index], c_then, p_then, elapsed
     )
 
-    def spread(part: FloatArray, rest: FloatArray) -> FloatArray:
-        whole = rest.copy()
-        whole[index] = part
-        return whole
-
-    nothing = np.zeros(len(pairs))
-    judged = np.zeros(len(pairs), np.bool_)
-    judged[index] = elapsed > 0
-    fired = np.zeros(len(pairs), np.bool_)
-    fired[index] = fires & (elapsed > 0)
+    count = len(pairs)
+    distance_then, lookback, way = distance.copy(), np.zeros(count), np.zeros(count)
+    distance_then[index], lookback[index], way[index] = then, elapsed, displacement
+    fired = np.zeros(count, np.bool_)
+    judged = lookback > 0
+    fired[index] = fires & judged[index]
     return PairVerdicts(
         fires=fired,
         judged=judged,
         distance_m=distance,
-        distance_then_m=spread(then, distance),
-        lookback_s=spread(elapsed, nothing),
-        displacement_m=spread(displacement, nothing),
+        distance_then_m=distance_then,
+        lookback_s=lookback,
+        displacement_m=way,
         speed_mps=speed,
         d_max_m=d_max,
     )

@@ -42,9 +42,8 @@ class Tracker:
         xy = lanes.xy_m[0][slot]
         velocity = self._remember(ids.tolist(), xy, time_s)
         matched = lanes.detection[0][slot]
-        detection = np.full(len(slot), -1, np.int64)
-        hit = matched >= 0
-        detection[hit] = points.detection[matched[hit]]
+        # Index -1 reads the last detection; the extra -1 at the end makes that "none".
+        detection = np.append(points.detection, -1)[matched]
         self._slot = slot
         return Tracks(
             time_s=time_s,
