@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -186,3 +188,24 @@ def test_an_event_file_that_cannot_be_written_stops_before_the_replay(make_clip,
     with pytest.raises(TelemetryError, match="/nowhere"):
         replay(load_config(small_config(clip)), str(clip), eye=eye, files=files)
     assert eye.looks == 0
+
+
+def test_an_interrupt_ends_with_what_there_is_and_says_so(make_clip, small_config, tmp_path):
+    clip = make_clip("ride.avi", 300)
+    events = tmp_path / "events.jsonl"
+
+    def interrupt(frames: int) -> None:
+        if frames == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = replay(
+        load_config(small_config(clip)),
+        str(clip),
+        eye=Script(),
+        files=ReplayFiles(events=events),
+        progress=interrupt,
+    )
+    assert result.interrupted
+    assert result.as_dict()["interrupted"] is True
+    assert 5 <= result.frames < 300
+    assert len(lines(events)) == result.frames + 1
