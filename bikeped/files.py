@@ -9,13 +9,17 @@ from pathlib import Path
 from bikeped.errors import BikepedError
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Writes `text` as UTF-8 under a temporary name and renames it; BikepedError when it cannot."""
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Writes text (as UTF-8) or bytes under a temporary name and renames it.
+
+    BikepedError, naming the file and the mend, when it cannot.
+    """
+    data = content.encode("utf-8") if isinstance(content, str) else content
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
             Path(name).chmod(0o644)
             Path(name).replace(path)
         except BaseException:

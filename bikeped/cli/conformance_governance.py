@@ -17,15 +17,16 @@ from bikeped.cli.common import (
     progress_bar,
     write_json,
 )
+from bikeped.cli.conformance_shared import load_suite, scenarios_option
 from bikeped.cli.governance_tables import count, print_contest, print_gates, print_register
 from bikeped.cli.guard import guarded
-from bikeped.config import LoadedConfig, load_config
+from bikeped.config import load_config
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError, ConfigError
-from bikeped.files import write_whole
+from bikeped.files import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from bikeped.conformance.suite import Suite
+    pass
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -34,17 +35,6 @@ def add_commands(group: click.Group) -> None:
     """Adds the governance commands to `bikeped conformance`."""
     for command in (gate, promote, contest, register, plot):
         group.add_command(command)
-
-
-def scenarios_option(command: F) -> F:
-    """`--scenarios DIR` in place of the bundled suite."""
-    return click.option(
-        "--scenarios",
-        "scenarios_dir",
-        type=click.Path(path_type=Path),
-        metavar="DIR",
-        help="Folder of scenario files in place of the bundled ones.",
-    )(command)
 
 
 @click.command("gate")
@@ -71,7 +61,7 @@ def gate(
     rest, own = _split(overrides)
     decision = load_decision(candidate, own)
     loaded = load_config(config_path, rest)
-    suite = _suite(loaded, scenarios_dir)
+    suite = load_suite(loaded, scenarios_dir)
     metrics = suite.measure(decision)
     gates = check(metrics)
     if json_path is not None:
@@ -131,7 +121,7 @@ def promote(
     path = config_path or Path("config.yaml")
     loaded = load_config(path)
     decision = load_decision(candidate, own)
-    suite = _suite(loaded, scenarios_dir)
+    suite = load_suite(loaded, scenarios_dir)
     metrics = suite.measure(decision)
     gates = check(metrics)
     files = [("candidate", candidate)] + ([("trace", trace)] if trace is not None else [])
@@ -201,10 +191,10 @@ def contest(
         )
     loaded = load_config(config_path)
     other = load_config(config_path, overrides)
-    before = _suite(loaded, scenarios_dir)
+    before = load_suite(loaded, scenarios_dir)
     # Another camera sees otherwise; with the same one, what was seen is not computed again.
     same_camera = not _split(overrides)[0]
-    after = before if same_camera else _suite(other, scenarios_dir)
+    after = before if same_camera else load_suite(other, scenarios_dir)
     if added:
         after = contesting.with_scenarios(after, [load_scenario(path) for path in added])
     if truth:
@@ -240,7 +230,7 @@ def register(
     from bikeped.conformance.register import build
 
     loaded = load_config(config_path, overrides)
-    found = build(_suite(loaded, scenarios_dir), loaded.config.decision)
+    found = build(load_suite(loaded, scenarios_dir), loaded.config.decision)
     if json_path is not None:
         write_json({"config_hash": loaded.hash, **found.as_dict()}, json_path)
     if out is not None:
@@ -277,7 +267,7 @@ def plot(
 
     require_matplotlib()
     loaded = load_config(config_path, overrides)
-    suite = _suite(loaded, scenarios_dir)
+    suite = load_suite(loaded, scenarios_dir)
     if name is not None and name not in suite.names:
         import difflib
 
@@ -285,7 +275,7 @@ def plot(
         mend = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(suite.names)}"
         raise BikepedError(f"--scenario {name}: no scenario of this name; {mend}")
     indices = [i for i, n in enumerate(suite.names) if name is None or n == name]
-    _make_folder(out)
+    make_folder(out)
     files: list[Path] = []
     with progress_bar("drawing", len(indices)) as tell:
         for done, index in enumerate(indices, 1):
@@ -298,26 +288,10 @@ def plot(
     return 0
 
 
-def _suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
-    from bikeped.conformance.scenario import bundled_folder, load_scenarios
-    from bikeped.conformance.suite import Suite
-
-    return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
-
-
 def _split(overrides: tuple[str, ...]) -> tuple[list[str], list[str]]:
     """Overrides of the camera and the rest, and those of the decision."""
     own = [o for o in overrides if o.strip().startswith("decision.")]
     return [o for o in overrides if o not in own], own
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BikepedError(
-            f"--out {folder}: cannot be made ({error.strerror}); choose another folder"
-        ) from error
 
 
 def _command_line(

@@ -13,7 +13,6 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from bikeped.cli.common import config_options, console, json_option, write_json
-from bikeped.cli.conformance_governance import scenarios_option
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 
@@ -22,6 +21,17 @@ if TYPE_CHECKING:
     from bikeped.conformance.tables import Cell, Result, Table
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+def scenarios_option(command: F) -> F:
+    """`--scenarios DIR` in place of the bundled suite."""
+    return click.option(
+        "--scenarios",
+        "scenarios_dir",
+        type=click.Path(path_type=Path),
+        metavar="DIR",
+        help="Folder of scenario files in place of the bundled ones.",
+    )(command)
 
 
 def suite_options(function: F) -> F:
@@ -112,12 +122,16 @@ def begin(
     scenarios_dir: Path | None,
 ) -> tuple[LoadedConfig, Suite]:
     """Configuration and suite, and every quick check before the work."""
+    loaded = load_config(config_path, overrides)
+    return loaded, load_suite(loaded, scenarios_dir)
+
+
+def load_suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
+    """The scenarios of a folder (None: the bundled ones) before the configured camera."""
     from bikeped.conformance.scenario import bundled_folder, load_scenarios
     from bikeped.conformance.suite import Suite
 
-    loaded = load_config(config_path, overrides)
-    scenarios = load_scenarios(scenarios_dir or bundled_folder())
-    return loaded, Suite.load(scenarios, loaded)
+    return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
 
 
 def emit(

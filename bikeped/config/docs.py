@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from bikeped.config.sections import Config
+from bikeped.files import write_whole
 
 _INTRO = """\
 # Configuration
@@ -110,7 +111,7 @@ def _values(item: dict[str, Any]) -> str:
 def main(arguments: list[str]) -> int:
     """Writes the page to the file named, or to standard output."""
     if arguments:
-        Path(arguments[0]).write_text(markdown(), encoding="utf-8")
+        write_whole(Path(arguments[0]), markdown())
     else:
         sys.stdout.write(markdown())
     return 0

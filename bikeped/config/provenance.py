@@ -76,11 +76,13 @@ def camera_hash(loaded: LoadedConfig) -> str:
 
 
 def code_hash(packages: Iterable[str] = DECIDING_CODE) -> str:
-    """SHA-256 over the sources of parts of bikeped, names and contents, in order of name."""
+    """SHA-256 over the sources of parts of bikeped (packages or modules), names and contents."""
     root = Path(__file__).parent.parent
     digest = hashlib.sha256()
     for package in sorted(packages):
-        for file in sorted((root / package).glob("*.py")):
+        folder = root / package
+        files = sorted(folder.glob("*.py")) if folder.is_dir() else [root / f"{package}.py"]
+        for file in files:
             content = file.read_bytes()
             digest.update(f"{package}/{file.name} {len(content)}\n".encode())
             digest.update(content)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.errors import BikepedError
+from bikeped.files import write_whole
 from bikeped.types import FloatArray
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BLACK, GREY, LIGHT = "#1a1a1a", "#6b6b6b", "#d9d9d9"
-BLUE, SKY, GREEN, YELLOW = "#0072b2", "#56b4e9", "#009e73", "#f0e442"
+BLUE, SKY, GREEN = "#0072b2", "#56b4e9", "#009e73"
 ORANGE, RED, PURPLE = "#e69f00", "#d55e00", "#cc79a7"
 #: One look a series, in order: colour, marker, dash.
 SERIES = (
@@ -178,12 +179,7 @@ class Sheet:
             data = io.BytesIO()
             self.figure.savefig(data, format=kind, metadata=metadata)
             path = folder / f"{stem}.{kind}"
-            try:
-                path.write_bytes(data.getvalue())
-            except OSError as error:
-                raise BikepedError(
-                    f"{path}: cannot be written ({error.strerror}); choose a folder that exists"
-                ) from error
+            write_whole(path, data.getvalue())
             paths.append(path)
         return paths
 

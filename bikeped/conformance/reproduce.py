@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.config import LoadedConfig
+from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.conformance import deployment, experiments, latency, montecarlo, optimizer
 from bikeped.conformance.experiments import Progress, provenance, quiet
 from bikeped.conformance.perception import RecallModel
@@ -28,8 +29,8 @@ from bikeped.conformance.tables import Result, Table
 from bikeped.conformance.workers import workers
 from bikeped.files import make_folder, write_whole
 
-#: Packages whose source decides what an experiment gives.
-_CODE = ("conformance", "decision", "geometry", "tracking", "config")
+#: Parts of bikeped whose source decides what an experiment gives.
+_CODE = (*DECIDING_CODE, *MEASURING_CODE, "config", "types")
 
 
 @dataclass(frozen=True)
@@ -140,17 +141,8 @@ SHOWN_ORDER = (
 
 @cache
 def code_version() -> str:
-    """SHA-256 over the sources that decide a result."""
-    package = Path(__file__).parent.parent
-    files = [package / "types.py"]
-    for name in _CODE:
-        files += (package / name).glob("*.py")
-    digest = hashlib.sha256()
-    for file in sorted(files):
-        digest.update(f"{file.relative_to(package).as_posix()}\0".encode())
-        digest.update(file.read_bytes())
-    digest.update(np.__version__.encode())
-    return digest.hexdigest()
+    """SHA-256 over the sources and the numpy that decide a result."""
+    return hashlib.sha256(f"{code_hash(_CODE)} {np.__version__}".encode()).hexdigest()
 
 
 def key_of(name: str, suite: Suite, loaded: LoadedConfig, settings: Settings) -> str:

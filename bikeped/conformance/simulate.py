@@ -44,7 +44,7 @@ class Scene:
 class Tracked:
     """What the tracker reported in every lane and frame, as arrays [f, lane, slot].
 
-    Before prediction: `predicted` makes the rows that the rules read.
+    Before prediction: `rows_of` makes the rows that the rules read.
     """
 
     reported: BoolArray

@@ -81,11 +81,6 @@ class Eye:
         uv, seen = unbounded.project(ground)
         return np.where(seen[:, None], self.framing.crop_to_frame(uv), np.nan)
 
-    def pixels_per_metre(self, xyz_m: FloatArray) -> float:
-        """Size of a metre at `xyz_m` [3], across the line of sight, near the optical axis."""
-        away = float(np.linalg.norm(xyz_m - self.position))
-        return self.camera.lens.focal_px / self.framing.scale / max(away, 0.1)
-
 
 def paint(image: ImageArray, eye: Eye, parts: Sequence[Part]) -> None:
     """Draws `parts` of one solid into `image`, far ones first."""

@@ -1,6 +1,7 @@
 """From detections to a decision: ground, track, predict, decide.
 
-The pole, a replay and the pixel simulation all run this class; it has no clock and no I/O.
+The pole and a replay both run this class. Frames bring their own time; the clock is read only to
+tell how long the stages took, and there is no I/O.
 """
 
 from __future__ import annotations
