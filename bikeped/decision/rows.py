@@ -115,7 +115,8 @@ class RowBuffer:
                 f"time_s: {time_s} is not after the last frame's {self._starts[-1][0]}"
             )
         count = len(ids)
-        if self._used + count > len(self._frame):
+        # Empty frames fill no rows, but they count: a night without anybody has a million of them.
+        if self._used + count > len(self._frame) or len(self._starts) >= len(self._frame):
             self._make_room(time_s, count)
         last = self._starts[-1][1] if self._starts else 0
         first, end = self._used, self._used + count

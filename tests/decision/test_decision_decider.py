@@ -118,6 +118,17 @@ def test_only_a_moment_of_the_past_is_held():
     assert decider._buffer.frames <= 512
 
 
+def test_a_night_without_anybody_is_not_remembered():
+    decider = Decider(SELECTED)
+    for i in range(5000):
+        step(decider, i / 30, {})
+    assert decider._buffer.frames <= 512
+    near = {1: (PEDESTRIAN, 8.0, 0.0), 2: (CYCLIST, 8.0, 9.0)}
+    nearer = {1: (PEDESTRIAN, 8.0, 0.0), 2: (CYCLIST, 8.0, 8.8)}
+    step(decider, 5000 / 30, near)
+    assert step(decider, 5001 / 30, nearer).state is State.ALERT
+
+
 # ---- sentences
 
 
