@@ -48,6 +48,7 @@ class Outcome:
     """Everything that is known of one frame when the light has been told."""
 
     picture: Picture
+    t_s: float  #: capture time since the first frame judged
     detections: Detections
     judgement: Judgement
     signal: Signal
@@ -112,6 +113,7 @@ class Loop:
         self._decode_fault: tuple[str, float] | None = None
         self._detector_fault: tuple[str, float] | None = None
         self._answered_s: float | None = None  # capture time of the newest frame answered
+        self._first_s: float | None = None  # capture time of the first frame judged
         self._judged_s: float | None = None  # capture time of the newest frame judged
         self._looking_since_s: float | None = None
         self._usual_look_s = self._usual_decode_s = 0.0
@@ -293,7 +295,10 @@ class Loop:
             "total": total_ms,
             "capture_age": total_ms + picture.acquire_ms,
         }
-        outcome = Outcome(picture, answer.detections, judgement, signal, latency)
+        if self._first_s is None:
+            self._first_s = frame.captured_s
+        t_s = frame.captured_s - self._first_s
+        outcome = Outcome(picture, t_s, answer.detections, judgement, signal, latency)
         for output in self._outputs:
             await self._hand_on(output, outcome)
 

@@ -32,15 +32,12 @@ class Tally:
     detections: int = 0
     not_on_ground: int = 0
     alerts: list[dict[str, Any]] = field(default_factory=list)
-    first_s: float | None = None
-    last_s: float = 0.0
+    duration_s: float = 0.0
     _alerting: bool = False
 
     async def frame(self, outcome: Outcome) -> None:
         frame, judgement = outcome.picture.frame, outcome.judgement
-        if self.first_s is None:
-            self.first_s = frame.captured_s
-        self.last_s = frame.captured_s
+        self.duration_s = outcome.t_s
         self.detections += len(outcome.detections)
         self.not_on_ground += judgement.not_on_ground
         decision = judgement.decision
@@ -51,7 +48,7 @@ class Tally:
         if alerting and not self._alerting:
             self.alerts.append(
                 {
-                    "t": round(frame.captured_s - self.first_s, 3),
+                    "t": round(outcome.t_s, 3),
                     "frame": frame.number,
                     "sentence": decision.sentence,
                     "frames": 0,
@@ -67,12 +64,9 @@ class EventFile:
 
     def __init__(self, path: Path, header: EventHeader) -> None:
         self._writer = EventWriter(path, header)
-        self._first_s: float | None = None
 
     async def frame(self, outcome: Outcome) -> None:
-        if self._first_s is None:
-            self._first_s = outcome.picture.frame.captured_s
-        self._writer.write(line_of(outcome, self._first_s))
+        self._writer.write(line_of(outcome))
 
     def __enter__(self) -> EventFile:
         return self
@@ -95,19 +89,16 @@ class OverlayVideo:
         self._sink, self._judge = sink, judge
         self._fov_deg = math.degrees(2 * judge.camera.lens.max_theta_rad)
         self._drawing: asyncio.Task[None] | None = None
-        self._first_s: float | None = None
 
     async def frame(self, outcome: Outcome) -> None:
         await self.wait()
         frame, judgement = outcome.picture.frame, outcome.judgement
-        if self._first_s is None:
-            self._first_s = frame.captured_s
         moment = Moment(
             detections=outcome.detections,
             tracks=judgement.tracks,
             decision=judgement.decision,
             frame_number=frame.number,
-            time_s=frame.captured_s - self._first_s,
+            time_s=outcome.t_s,
             latency_s=outcome.latency_ms["total"] / 1e3,
             history={k: np.asarray(v) for k, v in self._judge.tracker.history().items()},
         )

@@ -66,7 +66,7 @@ class ReplayResult:
             "frames": self.frames,
             "interrupted": self.interrupted,
             "undecodable": self.undecodable,
-            "duration_s": round(tally.last_s - (tally.first_s or 0.0), 3),
+            "duration_s": round(tally.duration_s, 3),
             "states": dict(sorted(tally.states.items())),
             "tracks": {kind: len(ids) for kind, ids in sorted(tally.tracks.items())},
             "alerts": tally.alerts,

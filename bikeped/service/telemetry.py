@@ -59,7 +59,6 @@ class Telemetry:
         self._shown: tuple[str, tuple[str, ...]] | None = None
         self._next_tracks_s = -math.inf
         self._started_s = clock()
-        self._first_captured_s: float | None = None
         self._recent: deque[float] = deque(maxlen=240)  # when frames were judged
         self._last: Outcome | None = None
         self._signal: Signal | None = None
@@ -77,9 +76,7 @@ class Telemetry:
                 latency_ms=outcome.latency_ms,
             )
         if self._audit is not None:
-            if self._first_captured_s is None:
-                self._first_captured_s = outcome.picture.frame.captured_s
-            self._audit.write(line_of(outcome, self._first_captured_s))
+            self._audit.write(line_of(outcome))
         if self._mqtt is not None and now_s >= self._next_tracks_s:
             self._next_tracks_s = self._due(now_s)
             message = tracks_message(
@@ -190,12 +187,11 @@ class Telemetry:
         return max(self._next_tracks_s + interval_s, now_s + interval_s / 2)
 
 
-def line_of(outcome: Outcome, first_captured_s: float) -> EventLine:
+def line_of(outcome: Outcome) -> EventLine:
     """The event line of an outcome."""
-    frame = outcome.picture.frame
     return event_line(
-        t_s=frame.captured_s - first_captured_s,
-        frame=frame.number,
+        t_s=outcome.t_s,
+        frame=outcome.picture.frame.number,
         decision=outcome.judgement.decision,
         tracks=outcome.judgement.tracks,
         detections=outcome.detections,
