@@ -1,0 +1,1 @@
+"""Conformance from pixels: drawn scenarios through the deployed loop, compared with the truth."""

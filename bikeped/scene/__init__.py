@@ -1,0 +1,1 @@
+"""Scenarios as fisheye pictures with exact labels: a known world for the chain from pixels on."""

@@ -1,0 +1,1 @@
+"""The pages on the box: live view, alignment and the test bench."""
