@@ -1,0 +1,77 @@
+"""What the corner finder hands to the adjustment: a board, and where its corners were seen.
+
+Pixels have their origin in the middle of the top left pixel (OpenCV's convention), u right, v down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bikeped.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class BoardPattern:
+    """A checkerboard by its inner corners: `columns` x `rows`, squares of `square_m` metres.
+
+    Corner `id` lies in column id % columns and row id // columns. Without a measured square the
+    board's own unit (1.0) serves: intrinsics do not depend on it.
+    """
+
+    columns: int
+    rows: int
+    square_m: float = 1.0
+
+    @property
+    def count(self) -> int:
+        return self.columns * self.rows
+
+    def corners_m(self) -> FloatArray:
+        """[columns * rows, 3] the flat board's corners by id, z = 0, the middle as origin."""
+        column, row = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        flat = np.stack([column.ravel(), row.ravel(), np.zeros(self.count)], axis=1)
+        middle = np.array([(self.columns - 1) / 2, (self.rows - 1) / 2, 0.0])
+        out: FloatArray = (flat - middle) * self.square_m
+        return out
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One picture's corners: `ids` [n] ascending and unique, `uv_px` [n, 2]; n may be partial."""
+
+    name: str  #: of the picture, for people: a file's path, or frame 120 of a video
+    ids: IntArray
+    uv_px: FloatArray
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if self.uv_px.shape != (len(self.ids), 2):
+            raise ValueError(
+                f"BoardView.uv_px: expected shape ({len(self.ids)}, 2), got {self.uv_px.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A picture that is not used, and why, in words for the person who took it."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found in a set of pictures of one size."""
+
+    pattern: BoardPattern
+    views: Sequence[BoardView]
+    refused: Sequence[Refused]
+    pictures: int  #: looked at, refused ones included
+    pictures_hash: str  #: SHA-256 over the pictures' bytes, in order of name
