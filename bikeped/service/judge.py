@@ -96,10 +96,25 @@ class Judge:
         times must increase: a frame that is not newer than the last one is a ValueError.
         """
         began = time.perf_counter()
+        points, not_on_ground = self.ground(detections, self.framing_of(width, height))
+        return self.judge_points(points, captured_s, age_s, not_on_ground, began)
+
+    def judge_points(
+        self,
+        points: GroundPoints,
+        captured_s: float,
+        age_s: float = 0.0,
+        not_on_ground: int = 0,
+        began: float | None = None,
+    ) -> Judgement:
+        """The judgement of what stands at `points`, as `judge` goes on after the ground table.
+
+        `began` is the `time.perf_counter()` from which `track_ms` counts; None: now.
+        """
+        began = time.perf_counter() if began is None else began
         if not captured_s > self._last_s:  # NaN included
             raise ValueError(f"captured_s: {captured_s} is not after {self._last_s}")
         self._last_s = captured_s
-        points, not_on_ground = self.ground(detections, self.framing_of(width, height))
         tracks = self.tracker.update(points, captured_s)
         tracked = time.perf_counter()
         decision = self._decider.step(
