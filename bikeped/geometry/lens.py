@@ -47,7 +47,7 @@ def canonical_projection(name: str) -> Projection:
     return cast(Projection, proper)
 
 
-def _curve(projection: str, theta: FloatArray) -> FloatArray:
+def curve(projection: str, theta: FloatArray) -> FloatArray:
     """g(theta), the radius for f = 1 without radial terms."""
     if projection == "equidistant":
         return theta
@@ -60,7 +60,7 @@ def _curve(projection: str, theta: FloatArray) -> FloatArray:
     return np.asarray(np.tan(theta))
 
 
-def _slope(projection: str, theta: FloatArray) -> FloatArray:
+def curve_slope(projection: str, theta: FloatArray) -> FloatArray:
     """dg/dtheta."""
     if projection == "equidistant":
         return np.ones_like(theta)
@@ -73,7 +73,7 @@ def _slope(projection: str, theta: FloatArray) -> FloatArray:
     return np.asarray(1 / np.cos(theta) ** 2)
 
 
-def _inverse_curve(projection: str, radius: FloatArray) -> FloatArray:
+def inverse_curve(projection: str, radius: FloatArray) -> FloatArray:
     """theta for f = 1 without radial terms; radii outside the model give its limit."""
     if projection == "equidistant":
         return radius
@@ -139,7 +139,7 @@ class Lens:
         """
         proper = canonical_projection(projection)
         half = math.radians(fov_deg) / 2
-        unit = float(_curve(proper, np.asarray([min(half, _LIMITS[proper])], dtype=np.float64))[0])
+        unit = float(curve(proper, np.asarray([min(half, _LIMITS[proper])], dtype=np.float64))[0])
         if unit <= 0:
             raise GeometryError(f"fov_deg: {fov_deg} gives no focal length; use a positive angle")
         return Lens(proper, radius_px / unit, half, k)
@@ -152,7 +152,7 @@ class Lens:
     def radius(self, theta: npt.ArrayLike) -> FloatArray:
         """Image radius in pixels at angles `theta` (radians, any shape)."""
         angle = np.asarray(theta, dtype=np.float64)
-        base = _curve(self.projection, angle)
+        base = curve(self.projection, angle)
         if any(self.k):
             base = base * self._gain(angle)
         return self.focal_px * base
@@ -167,13 +167,13 @@ class Lens:
         inside = radius <= self.max_radius_px * (1 + 1e-12)
         unit = radius / self.focal_px
         if not any(self.k):
-            angle = _inverse_curve(self.projection, unit)
+            angle = inverse_curve(self.projection, unit)
         else:
             angle = np.interp(radius, self._radius_table, self._theta_table)
             for _ in range(4):  # quadratic from 1e-3 at worst: four steps reach the last bit
                 gain, bend = self._gain(angle), self._bend(angle)
-                base = _curve(self.projection, angle)
-                slope = _slope(self.projection, angle) * gain + base * bend
+                base = curve(self.projection, angle)
+                slope = curve_slope(self.projection, angle) * gain + base * bend
                 with np.errstate(divide="ignore", invalid="ignore"):
                     step = np.where(slope > 1e-9, (base * gain - unit) / slope, 0.0)
                 angle = np.clip(angle - step, 0, self.max_theta_rad)
