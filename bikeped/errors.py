@@ -44,3 +44,7 @@ class TelemetryError(BikepedError):
 
 class ScenarioError(BikepedError):
     """A scenario file is malformed."""
+
+
+class DataSetError(BikepedError):
+    """Pictures with boxes, for training or evaluation, are missing or malformed."""

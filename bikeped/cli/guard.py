@@ -21,6 +21,8 @@ _INPUTS = {
     "added": "--scenario",
     "trace": "--trace",
     "curve_path": "--recall-curve",
+    "data": "DATA",
+    "models": "MODEL",
 }
 _OUTPUTS = {
     "json_path": "--json",
@@ -28,6 +30,8 @@ _OUTPUTS = {
     "events": "--events",
     "audit_path": "--audit",
     "out": "--out",
+    "figure": "--figure",
+    "curve_out": "--curve",
 }
 
 

@@ -20,6 +20,7 @@ COMMANDS = {
     "config": "bikeped.cli.config",
     "doctor": "bikeped.cli.doctor",
     "conformance": "bikeped.cli.conformance",
+    "model": "bikeped.cli.model",
 }
 
 

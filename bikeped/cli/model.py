@@ -1,0 +1,29 @@
+"""`bikeped model`: the detector's own tooling."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import click
+
+#: Command: module that holds it as `command`, imported only when asked for.
+COMMANDS = {
+    "augment": "bikeped.cli.model_augment",
+}
+
+
+class _Lazy(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        module = COMMANDS.get(cmd_name)
+        if module is None:
+            return None
+        found: click.Command = import_module(module).command
+        return found
+
+
+@click.group("model", cls=_Lazy)
+def command() -> None:
+    """Augment data, train, export and evaluate detectors."""

@@ -1,0 +1,311 @@
+"""Fisheye augmentation: a data set of ordinary pictures becomes one of fisheye pictures.
+
+What one picture becomes depends on the seed, its id and the number of the copy alone, never on the
+order or on who works on it. The new data set appears whole or not at all.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from bikeped import __version__
+from bikeped.conformance.workers import workers
+from bikeped.errors import DataSetError
+from bikeped.training.coco import CocoData, CocoImage, CocoObject, read_picture, write_annotations
+from bikeped.training.warp import Warp, WarpRanges, sample_warp, warp_boxes, warp_picture
+from bikeped.types import BoolArray, FloatArray, ImageArray
+
+#: An object of which less than this share of its area is left is dropped,
+LEAST_SHARE = 0.3
+#: and so is one whose box is narrower or lower than this, in pixels of the new picture.
+LEAST_SIDE_PX = 3.0
+JPEG_QUALITY = 95
+_BATCH = 8  # pictures a job: few enough that both processes end at the same time
+_SMALL = 8  # below this many pictures, starting processes takes longer than the work
+
+
+@dataclass(frozen=True)
+class AugmentSettings:
+    """How a data set is augmented."""
+
+    ranges: WarpRanges = field(default_factory=WarpRanges)
+    seed: int = 0
+    copies: int = 1
+    least_share: float = LEAST_SHARE
+    processes: int = 2
+
+    def __post_init__(self) -> None:
+        if self.copies < 1 or self.processes < 1 or self.seed < 0:
+            raise DataSetError("copies and processes: at least 1; seed: at least 0")
+        if not 0 <= self.least_share <= 1:
+            raise DataSetError(f"least-share: {self.least_share} is not within 0 to 1")
+
+
+@dataclass(frozen=True)
+class AugmentSummary:
+    """What an augmentation made."""
+
+    folder: Path
+    pictures: int
+    objects: int
+    dropped: int  #: objects of which too little was left
+    empty: int  #: boxes of the source without area, passed over
+    by_category: Mapping[str, int]
+    seed: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "folder": str(self.folder),
+            "pictures": self.pictures,
+            "objects": self.objects,
+            "dropped": self.dropped,
+            "boxes_without_area": self.empty,
+            "by_category": dict(self.by_category),
+            "seed": self.seed,
+        }
+
+
+def augment_picture(
+    image: ImageArray,
+    box_px: npt.ArrayLike,
+    warp: Warp,
+    *,
+    polygons: Sequence[Sequence[FloatArray]] | None = None,
+    crowd: npt.ArrayLike | None = None,
+    least_share: float = LEAST_SHARE,
+    least_side_px: float = LEAST_SIDE_PX,
+) -> tuple[ImageArray, FloatArray, BoolArray]:
+    """A picture [h, w, 3] and its boxes [n, 4] (x1, y1, x2, y2) through one lens.
+
+    Gives the new picture [size, size, 3], the boxes [n, 4] in it and which of them are kept [n]:
+    at least `least_share` of the object's area is still seen and its box measures `least_side_px`
+    each way. A crowd region is kept while anything of it is left, for it says where not to judge.
+    Boxes that are not kept may be NaN. Pure.
+    """
+    high, wide = image.shape[:2]
+    boxes, kept = augment_boxes(
+        box_px,
+        (wide, high),
+        warp,
+        polygons=polygons,
+        crowd=crowd,
+        least_share=least_share,
+        least_side_px=least_side_px,
+    )
+    return warp_picture(image, warp), boxes, kept
+
+
+def augment_boxes(
+    box_px: npt.ArrayLike,
+    picture_wh: tuple[int, int],
+    warp: Warp,
+    *,
+    polygons: Sequence[Sequence[FloatArray]] | None = None,
+    crowd: npt.ArrayLike | None = None,
+    least_share: float = LEAST_SHARE,
+    least_side_px: float = LEAST_SIDE_PX,
+) -> tuple[FloatArray, BoolArray]:
+    """The boxes' part of `augment_picture`."""
+    boxes, share = warp_boxes(warp, picture_wh, box_px, polygons)
+    many: BoolArray = np.zeros(len(boxes), np.bool_)
+    if crowd is not None:
+        many |= np.asarray(crowd, np.bool_)
+    side = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf)
+    with np.errstate(invalid="ignore"):
+        kept = (side >= least_side_px) & (share >= least_share)
+        kept |= many & (side > 0)
+    return boxes, kept
+
+
+def picture_generator(seed: int, image_id: int, copy: int) -> np.random.Generator:
+    """Random numbers of one copy of one picture, whatever the order and whoever works on it."""
+    return np.random.default_rng([seed, image_id, copy])
+
+
+def augment_data(
+    data: CocoData,
+    out: Path,
+    settings: AugmentSettings,
+    progress: Callable[[int], None] = lambda done: None,
+) -> AugmentSummary:
+    """Writes the augmented data set to the new folder `out`: `annotations.json` and `images/`.
+
+    A picture that cannot be read ends it with a DataSetError, and then there is no `out`. The
+    source's licences, info and entries are carried along; every picture tells its lens.
+    """
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    dropped = 0
+    with _whole_folder(data, out) as folder:
+        (folder / "images").mkdir()
+        for done, made in enumerate(_results(data, folder / "images", settings), 1):
+            entries, found, lost = made
+            images += entries
+            annotations += found
+            dropped += lost
+            progress(done)
+        write_annotations(folder / "annotations.json", _header(data, settings), images, annotations)
+    counts = dict.fromkeys(data.categories.values(), 0)
+    for annotation in annotations:
+        counts[data.categories[annotation["category_id"]]] += 1
+    return AugmentSummary(
+        out, len(images), len(annotations), dropped, data.empty, counts, settings.seed
+    )
+
+
+_Made = tuple[list[dict[str, Any]], list[dict[str, Any]], int]
+
+
+def _results(data: CocoData, folder: Path, settings: AugmentSettings) -> Iterator[_Made]:
+    """What every source picture became, in any order."""
+    jobs = [(image, data.objects[image.id]) for image in data.images]
+    if settings.processes == 1 or len(jobs) * settings.copies <= _SMALL:
+        for job in jobs:
+            yield _copies(*job, folder, settings)
+        return
+    batches = iter([jobs[at : at + _BATCH] for at in range(0, len(jobs), _BATCH)])
+    with workers(settings.processes) as pool:
+        # A few batches ahead: a hundred thousand waiting results would be memory for nothing.
+        ahead = {
+            pool.submit(_batch, batch, folder, settings)
+            for batch in islice(batches, 3 * settings.processes)
+        }
+        while ahead:
+            finished, ahead = concurrent.futures.wait(
+                ahead, return_when=concurrent.futures.FIRST_COMPLETED
+            )
+            for future in finished:
+                yield from future.result()
+            for batch in islice(batches, len(finished)):
+                ahead.add(pool.submit(_batch, batch, folder, settings))
+
+
+def _batch(
+    jobs: list[tuple[CocoImage, tuple[CocoObject, ...]]], folder: Path, settings: AugmentSettings
+) -> list[_Made]:
+    cv2.setNumThreads(1)  # the processes share the cores already
+    return [_copies(image, objects, folder, settings) for image, objects in jobs]
+
+
+def _copies(
+    image: CocoImage, objects: tuple[CocoObject, ...], folder: Path, settings: AugmentSettings
+) -> _Made:
+    """Draws all copies of one picture; their entries, annotations, and how many were dropped."""
+    picture = read_picture(image)
+    entries: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    lost = 0
+    for copy in range(settings.copies):
+        warp = sample_warp(picture_generator(settings.seed, image.id, copy), settings.ranges)
+        drawn, boxes, kept = augment_picture(
+            picture,
+            [thing.box_px for thing in objects],
+            warp,
+            polygons=[thing.polygons for thing in objects],
+            crowd=[thing.crowd for thing in objects],
+            least_share=settings.least_share,
+        )
+        name = f"{image.id:012d}_{copy}.jpg"
+        _write_jpeg(folder / name, drawn)
+        new_id = image.id * settings.copies + copy
+        entries.append(
+            {
+                **image.entry,
+                "id": new_id,
+                "file_name": f"images/{name}",
+                "width": warp.size_px,
+                "height": warp.size_px,
+                "source": {"id": image.id, "file_name": image.file_name},
+                "warp": warp.as_dict(),
+            }
+        )
+        for thing, box, keep in zip(objects, boxes.tolist(), kept.tolist(), strict=True):
+            if keep:
+                annotations.append(_annotation(thing, box, new_id, copy, settings.copies))
+            else:
+                lost += 1
+    return entries, annotations, lost
+
+
+def _annotation(
+    thing: CocoObject, box: Sequence[float], image_id: int, copy: int, copies: int
+) -> dict[str, Any]:
+    # Three decimals: far below what anyone can mark, and no rounding noise in the file.
+    x1, y1, x2, y2 = (round(value, 3) for value in box)
+    wide, high = round(x2 - x1, 3), round(y2 - y1, 3)
+    return {
+        "id": thing.id * copies + copy,
+        "image_id": image_id,
+        "category_id": thing.category_id,
+        "bbox": [x1, y1, wide, high],
+        "area": round(wide * high, 3),
+        "iscrowd": int(thing.crowd),
+    }
+
+
+def _header(data: CocoData, settings: AugmentSettings) -> dict[str, Any]:
+    info = data.header.get("info")
+    record = {
+        "what": "fisheye augmentation by bikeped model augment",
+        "version": __version__,
+        "source": data.source.name,
+        "source_sha256": data.sha256,
+        "seed": settings.seed,
+        "copies": settings.copies,
+        "least_share": settings.least_share,
+        "ranges": settings.ranges.as_dict(),
+        "area": "of the box: segmentations are not carried along",
+    }
+    return {**data.header, "info": {**(info if isinstance(info, dict) else {}), "bikeped": record}}
+
+
+def _write_jpeg(path: Path, picture: ImageArray) -> None:
+    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    ok, content = cv2.imencode(".jpg", bgr, [int(cv2.IMWRITE_JPEG_QUALITY), JPEG_QUALITY])
+    if not ok:
+        raise DataSetError(f"{path}: the picture cannot be written as JPEG")
+    try:
+        path.write_bytes(content.tobytes())
+    except OSError as error:
+        raise DataSetError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+@contextmanager
+def _whole_folder(data: CocoData, out: Path) -> Iterator[Path]:
+    """A folder beside `out` that becomes `out` when all went well, and else disappears."""
+    target = out.resolve()
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise DataSetError(f"--out {out}: exists already; name a new folder")
+    sources = {data.source.resolve().parent, *(i.path.resolve().parent for i in data.images)}
+    for source in sources:
+        if target == source or source in target.parents:
+            raise DataSetError(
+                f"--out {out}: lies in the data's own folder {source}; name a folder beside it"
+            )
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    except OSError as error:
+        raise DataSetError(f"--out {out}: cannot be made ({error.strerror})") from error
+    try:
+        yield folder
+        folder.chmod(0o755)
+        os.replace(folder, target)  # noqa: PTH105 - onto an empty folder, too
+    except OSError as error:
+        raise DataSetError(f"--out {out}: cannot be written ({error.strerror})") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,374 @@
+"""An ordinary picture as a fisheye lens would have taken it, and its boxes with it.
+
+The picture is taken for a perspective view of `picture_fov_deg` over its longer side, turned about
+its own axis (roll), up or down (pitch) and sideways about the upright (yaw), and seen through a
+fisheye lens whose image circle lies in a square of `size_px`. Upright people so stay upright in
+space, and lean in the picture as they do before a level camera on a pole.
+
+Both cameras are `GroundCamera`s: the directions are those that the deployed ground table uses. A
+box becomes the tight upright rectangle of its *curve*: its four edges (or its object's outline),
+sampled densely and mapped, cut by the image circle and the picture. Four corners alone would miss
+the belly of a bent edge by tens of pixels.
+
+Points are in pixels from the upper left corner of the picture, as COCO's boxes are: the middle of
+the first pixel is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.errors import GeometryError
+from bikeped.geometry import GroundCamera, Lens, canonical_projection
+from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
+
+#: Samples of a box's edge, of an object's outline, and of the image circle's rim.
+EDGE_SAMPLES, OUTLINE_SAMPLES, RIM_SAMPLES = 256, 1024, 4096
+#: Where the lens sees and the picture has nothing: the grey that detectors know as "no picture".
+FILL = 114
+_SHARE_GRID = 24  # points a side that tell how much of a box is left
+_WIDEST = {"orthographic": 178.0, "stereographic": 300.0}  # short of the model's own end
+_ROOM = 359.0
+_WIDEST_PICTURE = 160.0
+
+Range = tuple[float, float]
+Size = tuple[int, int]  #: width, height in pixels
+
+
+@dataclass(frozen=True)
+class WarpRanges:
+    """What `sample_warp` draws from, uniformly; each range is (least, most).
+
+    `radius_share` and `shift_share` are the circle's radius and its centre's distance from the
+    middle, each way, as shares of `size_px`. `fov_deg` is what the circle spans; a projection that
+    cannot show as much (orthographic: 180) is drawn from the part of the range that it can.
+    """
+
+    projections: tuple[str, ...] = ("equidistant", "equisolid", "stereographic", "orthographic")
+    fov_deg: Range = (170.0, 210.0)
+    picture_fov_deg: Range = (90.0, 150.0)
+    yaw_deg: Range = (-50.0, 50.0)
+    pitch_deg: Range = (-40.0, 15.0)
+    roll_deg: Range = (-10.0, 10.0)
+    radius_share: Range = (0.42, 0.55)
+    shift_share: Range = (-0.04, 0.04)
+    size_px: int = 1280
+
+    def __post_init__(self) -> None:
+        if not self.projections:
+            raise GeometryError("projection: none is given; name one or more")
+        for name in self.projections:
+            if canonical_projection(name) == "perspective":
+                raise GeometryError("projection: perspective is no fisheye lens; name one of those")
+        for key, (least, most), low, high in (
+            ("fov-deg", self.fov_deg, 60.0, _ROOM),
+            ("picture-fov-deg", self.picture_fov_deg, 10.0, _WIDEST_PICTURE),
+            ("yaw-deg", self.yaw_deg, -180.0, 180.0),
+            ("pitch-deg", self.pitch_deg, -90.0, 90.0),
+            ("roll-deg", self.roll_deg, -180.0, 180.0),
+            ("radius", self.radius_share, 0.1, 2.0),
+            ("shift", self.shift_share, -0.5, 0.5),
+        ):
+            if not low <= least <= most <= high:  # NaN compares false
+                raise GeometryError(
+                    f"{key}: {least:g} to {most:g} is no range within {low:g} to {high:g}; "
+                    "give the smaller number first"
+                )
+        if not 64 <= self.size_px <= 8192:
+            raise GeometryError(f"size: {self.size_px} is not 64 to 8192 pixels")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the record that augmented data carry."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+@dataclass(frozen=True)
+class Warp:
+    """One drawn lens and direction; see the module. Angles as `GroundCamera` counts them."""
+
+    lens: Lens
+    centre_px: tuple[float, float]
+    size_px: int
+    picture_fov_deg: float
+    yaw_deg: float = 0.0
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    _fisheye: GroundCamera = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.picture_fov_deg <= _WIDEST_PICTURE:
+            raise GeometryError(
+                f"picture-fov-deg: {self.picture_fov_deg:g} is not within 0 to {_WIDEST_PICTURE:g}"
+            )
+        object.__setattr__(self, "_fisheye", GroundCamera(self.lens, *self.centre_px, height_m=1.0))
+
+    def forward(self, xy_px: FloatArray, picture_wh: Size) -> tuple[FloatArray, BoolArray]:
+        """Where points [..., 2] of the picture come to lie, and which are seen.
+
+        Seen means inside the image circle and inside the square.
+        """
+        ray = _picture_camera(picture_wh, self.picture_fov_deg, self.pitch_deg, self.yaw_deg).rays(
+            self._rolled(xy_px, picture_wh, self.roll_deg)
+        )
+        uv, _ = self._fisheye.project(ray + np.array([0.0, 0.0, 1.0]))
+        seen = ray[..., 0] > math.cos(self.lens.max_theta_rad)
+        return uv, seen & ((uv >= 0) & (uv <= self.size_px)).all(axis=-1)
+
+    def inverse(self, uv_px: FloatArray, picture_wh: Size) -> tuple[FloatArray, BoolArray]:
+        """Which points of the picture are seen at [..., 2], and where the picture has any.
+
+        Points outside the image circle are NaN.
+        """
+        ray = self._fisheye.rays(uv_px)
+        picture = _picture_camera(picture_wh, self.picture_fov_deg, self.pitch_deg, self.yaw_deg)
+        xy, ahead = picture.project(ray + np.array([0.0, 0.0, 1.0]))
+        xy = self._rolled(xy, picture_wh, -self.roll_deg)
+        inside = ((xy >= 0) & (xy <= np.asarray(picture_wh, np.float64))).all(axis=-1)
+        return xy, ahead & inside
+
+    def in_circle(self, uv_px: FloatArray) -> BoolArray:
+        """Which points [..., 2] lie inside the image circle."""
+        away = np.hypot(uv_px[..., 0] - self.centre_px[0], uv_px[..., 1] - self.centre_px[1])
+        return np.asarray(away <= self.lens.max_radius_px)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the record that an augmented picture carries."""
+        return {
+            "projection": self.lens.projection,
+            "fov_deg": round(math.degrees(2 * self.lens.max_theta_rad), 3),
+            "radius_px": round(self.lens.max_radius_px, 3),
+            "centre_px": [round(value, 3) for value in self.centre_px],
+            "picture_fov_deg": round(self.picture_fov_deg, 3),
+            "yaw_deg": round(self.yaw_deg, 3),
+            "pitch_deg": round(self.pitch_deg, 3),
+            "roll_deg": round(self.roll_deg, 3),
+        }
+
+    def _rolled(self, xy_px: FloatArray, picture_wh: Size, angle_deg: float) -> FloatArray:
+        """Points turned about the picture's middle, clockwise as one looks at it."""
+        if angle_deg == 0:
+            return xy_px
+        c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+        middle = np.asarray(picture_wh, np.float64) / 2
+        return np.asarray((xy_px - middle) @ np.array([[c, s], [-s, c]]) + middle)
+
+
+@functools.lru_cache(maxsize=64)
+def _picture_camera(
+    picture_wh: Size, fov_deg: float, pitch_deg: float, yaw_deg: float
+) -> GroundCamera:
+    """The perspective camera that took the picture, a metre above its own ground."""
+    wide, high = picture_wh
+    focal = max(wide, high) / 2 / math.tan(math.radians(fov_deg) / 2)
+    lens = Lens("perspective", focal, math.radians(89.5))
+    return GroundCamera(lens, wide / 2, high / 2, 1.0, pitch_deg, yaw_deg)
+
+
+def sample_warp(rng: np.random.Generator, ranges: WarpRanges) -> Warp:
+    """One warp out of the ranges. The same generator state gives the same warp."""
+    projection = ranges.projections[int(rng.integers(len(ranges.projections)))]
+    widest = _WIDEST.get(canonical_projection(projection), _ROOM)
+    least, most = (min(angle, widest) for angle in ranges.fov_deg)
+    fov_deg = float(rng.uniform(least, most))
+    size = ranges.size_px
+    lens = Lens.from_circle(projection, size * float(rng.uniform(*ranges.radius_share)), fov_deg)
+    shift_x, shift_y = (float(rng.uniform(*ranges.shift_share)) for _ in range(2))
+    picture_fov, yaw, pitch, roll = (
+        float(rng.uniform(*bounds))
+        for bounds in (ranges.picture_fov_deg, ranges.yaw_deg, ranges.pitch_deg, ranges.roll_deg)
+    )
+    centre = (size * (0.5 + shift_x), size * (0.5 + shift_y))
+    return Warp(lens, centre, size, picture_fov, yaw, pitch, roll)
+
+
+def warp_picture(image: ImageArray, warp: Warp) -> ImageArray:
+    """The picture [h, w, 3] through the lens: [size, size, 3], black outside the image circle.
+
+    Where the lens shrinks, a pixel takes the mean of what it covers: from copies of the picture at
+    half, a quarter, ... of its size, mixed by the local scale (the root of the area that a pixel
+    covers). Bilinear otherwise.
+    """
+    high, wide = image.shape[:2]
+    size = warp.size_px
+    axis = np.arange(size) + 0.5
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1)
+    out: ImageArray = (
+        np.where(warp.in_circle(grid)[..., None], FILL, 0).astype(np.uint8).repeat(3, axis=2)
+    )
+    left, top, right, low = _picture_window(warp, (wide, high))
+    if right <= left or low <= top:
+        return out
+    window = grid[top:low, left:right]
+    xy, inside = warp.inverse(window, (wide, high))
+    if not inside.any():
+        return out
+    level = _level(xy, inside)
+    part = out[top:low, left:right]
+    part[inside] = _mixed(image, xy.astype(np.float32), level, inside)[inside]
+    return out
+
+
+def _picture_window(warp: Warp, picture_wh: Size) -> tuple[int, int, int, int]:
+    """Pixels of the square that can show the picture: left, top, right, lower end, exclusive."""
+    whole = np.array([[0.0, 0.0, picture_wh[0], picture_wh[1]]])
+    box, share = warp_boxes(warp, picture_wh, whole)
+    if share[0] == 0 and not np.isfinite(box).all():
+        return 0, 0, 0, 0
+    limit = warp.size_px
+    left, top = (max(math.floor(value) - 1, 0) for value in box[0, :2])
+    right, low = (min(math.ceil(value) + 1, limit) for value in box[0, 2:])
+    return left, top, right, low
+
+
+def _level(xy: FloatArray, inside: BoolArray) -> Float32Array:
+    """[h, w] log2 of the local shrinking, 0 where the lens enlarges."""
+    if min(xy.shape[:2]) < 2:
+        return np.zeros(xy.shape[:2], np.float32)
+    x, y = xy[..., 0], xy[..., 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x_v, x_u = np.gradient(x)
+        y_v, y_u = np.gradient(y)
+        area = np.abs(x_u * y_v - x_v * y_u)
+        level = 0.5 * np.log2(np.maximum(area, 1.0))
+    return np.where(inside & np.isfinite(level), level, 0.0).astype(np.float32)
+
+
+def _mixed(
+    image: ImageArray, xy: Float32Array, level: Float32Array, inside: BoolArray
+) -> ImageArray:
+    """The picture read at `xy`, each pixel from the two copies around its level."""
+    high, wide = image.shape[:2]
+    most = max(0, math.floor(math.log2(max(min(high, wide) / 4, 1))))
+    level = np.minimum(level, most)
+    top = math.ceil(float(level.max()))
+    xy = np.where(inside[..., None], xy, np.float32(0))
+    mean = np.zeros((*xy.shape[:2], 3), np.float32)
+    copy = image
+    for step in range(top + 1):
+        if step:
+            half = (max(copy.shape[1] // 2, 1), max(copy.shape[0] // 2, 1))
+            copy = np.asarray(cv2.resize(copy, half, interpolation=cv2.INTER_AREA), np.uint8)
+        weight = np.maximum(1 - np.abs(level - step), 0)
+        if not weight.any():
+            continue
+        # remap counts from the middle of the first pixel.
+        across = xy[..., 0] * np.float32(copy.shape[1] / wide) - np.float32(0.5)
+        down = xy[..., 1] * np.float32(copy.shape[0] / high) - np.float32(0.5)
+        read = cv2.remap(copy, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        mean += read * weight[..., None]
+    return np.asarray(np.rint(mean), np.uint8)
+
+
+def warp_boxes(
+    warp: Warp,
+    picture_wh: Size,
+    box_px: npt.ArrayLike,
+    polygons: Sequence[Sequence[FloatArray]] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Boxes [n, 4] (x1, y1, x2, y2) of the picture after the warp, and the share of each left [n].
+
+    `polygons` are each object's outlines, empty where it has none: its box's edges then stand in.
+    The share is of the area in the original picture; what has none left is NaN.
+    """
+    boxes = np.asarray(box_px, np.float64).reshape(-1, 4)
+    result = np.full((len(boxes), 4), np.nan)
+    share = np.zeros(len(boxes))
+    border: tuple[FloatArray, FloatArray] | None = None
+    for index, box in enumerate(boxes):
+        rings = polygons[index] if polygons is not None else ()
+        curve = _box_edges(box) if len(rings) == 0 else np.concatenate([*map(_outline, rings)])
+        uv, seen = warp.forward(curve, picture_wh)
+        points = uv[seen]
+        if seen.all():
+            share[index] = 1.0
+        else:
+            if border is None:
+                border = _border(warp, picture_wh)
+            edge_uv, edge_xy = border
+            points = np.concatenate([points, edge_uv[_within(edge_xy, box, rings)]])
+            share[index] = _share_left(warp, picture_wh, box, rings)
+        if len(points):
+            result[index, :2], result[index, 2:] = points.min(axis=0), points.max(axis=0)
+    return result, share
+
+
+def _box_edges(box: FloatArray) -> FloatArray:
+    """[4 * EDGE_SAMPLES, 2] points along the four edges."""
+    x1, y1, x2, y2 = box
+    corners = np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
+    along = np.linspace(0, 1, EDGE_SAMPLES, endpoint=False)[None, :, None]
+    start, end = corners[:-1, None], corners[1:, None]
+    return np.asarray((start + (end - start) * along).reshape(-1, 2))
+
+
+def _outline(ring: FloatArray) -> FloatArray:
+    """A closed outline with points added, so that none are far apart."""
+    step = np.roll(ring, -1, axis=0) - ring
+    length = np.hypot(step[:, 0], step[:, 1])
+    spacing = max(float(length.sum()) / OUTLINE_SAMPLES, 1e-9)
+    parts = np.maximum(np.ceil(length / spacing), 1).astype(np.int64)
+    first = np.repeat(np.cumsum(parts) - parts, parts)
+    along = (np.arange(int(parts.sum())) - first) / np.repeat(parts, parts)
+    start, step = np.repeat(ring, parts, axis=0), np.repeat(step, parts, axis=0)
+    return np.asarray(start + step * along[:, None])
+
+
+def _border(warp: Warp, picture_wh: Size) -> tuple[FloatArray, FloatArray]:
+    """Points along the rim of what is seen that show the picture: in the square, in the picture."""
+    size = float(warp.size_px)
+    turn = np.linspace(0, 2 * math.pi, RIM_SAMPLES, endpoint=False)
+    rim = np.stack([np.cos(turn), np.sin(turn)], -1) * (warp.lens.max_radius_px * (1 - 1e-9))
+    rim += np.asarray(warp.centre_px)
+    fine = np.linspace(0, size, 2 * warp.size_px + 1)
+    ends = np.zeros_like(fine), np.full_like(fine, size)
+    edges = np.concatenate(
+        [np.stack([fine, end], -1) for end in ends] + [np.stack([end, fine], -1) for end in ends]
+    )
+    uv = np.concatenate([rim[((rim >= 0) & (rim <= size)).all(axis=1)], edges])
+    xy, inside = warp.inverse(uv, picture_wh)
+    return uv[inside], xy[inside]
+
+
+def _within(xy: FloatArray, box: FloatArray, rings: Sequence[FloatArray]) -> BoolArray:
+    """Which points [n, 2] of the picture belong to the object."""
+    inside: BoolArray = np.asarray(
+        (xy[:, 0] >= box[0]) & (xy[:, 1] >= box[1]) & (xy[:, 0] <= box[2]) & (xy[:, 1] <= box[3])
+    )
+    if len(rings) == 0 or not inside.any():
+        return inside
+    few = np.nonzero(inside)[0]
+    inside[few] = np.any([_in_ring(xy[few], ring) for ring in rings], axis=0)
+    return inside
+
+
+def _in_ring(xy: FloatArray, ring: FloatArray) -> BoolArray:
+    """Which points lie inside a closed outline (a ray to the right crosses it an odd number of
+    times)."""
+    x, y = xy[:, 0, None], xy[:, 1, None]
+    x1, y1 = ring[:, 0], ring[:, 1]
+    x2, y2 = np.roll(x1, -1), np.roll(y1, -1)
+    spans = (y1 > y) != (y2 > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
+    return np.asarray((spans & (x < crossing)).sum(axis=1) % 2 == 1)
+
+
+def _share_left(
+    warp: Warp, picture_wh: Size, box: FloatArray, rings: Sequence[FloatArray]
+) -> float:
+    """Share of the object's area in the picture that is still seen, on a grid of points."""
+    step = (np.arange(_SHARE_GRID) + 0.5) / _SHARE_GRID
+    x, y = box[0] + (box[2] - box[0]) * step, box[1] + (box[3] - box[1]) * step
+    grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    own = grid[_within(grid, box, rings)]
+    if len(own) == 0:  # thinner than the grid
+        own = grid
+    return float(warp.forward(own, picture_wh)[1].mean())
