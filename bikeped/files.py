@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 from pathlib import Path
@@ -29,6 +30,32 @@ def write_whole(path: Path, content: str | bytes) -> None:
         raise BikepedError(
             f"{path}: cannot be written ({error.strerror}); choose a folder that exists and that "
             "you may write"
+        ) from error
+
+
+def write_like(path: Path, content: bytes, like: Path) -> None:
+    """As `write_whole`, onto the disk, with the mode and owner of the file `like`.
+
+    For files that belong to somebody, such as config.yaml, and must survive a loss of power.
+    """
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            was = like.stat()
+            Path(name).chmod(was.st_mode & 0o7777)
+            with contextlib.suppress(PermissionError):  # only root gives files away
+                os.chown(name, was.st_uid, was.st_gid)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise BikepedError(
+            f"{path}: cannot be written ({error.strerror}); do it as a user who may write there"
         ) from error
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -29,6 +26,7 @@ from bikeped.conformance.gates import check
 from bikeped.conformance.metrics import Metrics
 from bikeped.conformance.suite import Suite, camera_json
 from bikeped.errors import BikepedError, ConfigError
+from bikeped.files import write_like
 
 
 @dataclass(frozen=True)
@@ -97,9 +95,9 @@ def promote(
     after = replace_section(before, str(config_path), decision, note)
     _compare(before, after, config_path, loaded, decision)
     files = Promoted(target, target.with_name(target.name + ".bak"), provenance_path(target))
-    _write(files.backup, before.encode(), target)
-    _write(files.provenance, msgspec.json.format(msgspec.json.encode(record)) + b"\n", target)
-    _write(files.config, after.encode(), target)
+    write_like(files.backup, before.encode(), target)
+    write_like(files.provenance, msgspec.json.format(msgspec.json.encode(record)) + b"\n", target)
+    write_like(files.config, after.encode(), target)
     return files
 
 
@@ -202,26 +200,3 @@ def _read(path: Path) -> str:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); give it with -c") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from error
-
-
-def _write(path: Path, content: bytes, like: Path) -> None:
-    """Writes under a temporary name, to the disk, and renames; mode and owner as of `like`."""
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            was = like.stat()
-            Path(name).chmod(was.st_mode & 0o7777)
-            with contextlib.suppress(PermissionError):  # only root gives files away
-                os.chown(name, was.st_uid, was.st_gid)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise BikepedError(
-            f"{path}: cannot be written ({error.strerror}); promote as a user who may write there"
-        ) from error

@@ -152,14 +152,14 @@ def test_absent_and_broken_provenance_end_in_one_line(place, content):
 
 
 def test_an_interruption_leaves_a_whole_configuration(place, monkeypatch):
-    real = promoting._write
+    real = promoting.write_like
 
     def stop_at_config(path, content, like):
         if path.name == "config.yaml":
             raise KeyboardInterrupt
         real(path, content, like)
 
-    monkeypatch.setattr(promoting, "_write", stop_at_config)
+    monkeypatch.setattr(promoting, "write_like", stop_at_config)
     with pytest.raises(click.exceptions.Abort):
         run("promote", place / "good.yaml", *options(place))
     assert (place / "config.yaml").read_text() == CONFIG
