@@ -91,6 +91,17 @@ def observe(
 ) -> Observed:
     """What one camera, or several fused, could detect; see the module's text."""
     seen = [see(scenario, camera, pose) for pose in where]
+    return fuse(scenario.name, seen, where, recall, visible_only)
+
+
+def fuse(
+    name: str,
+    seen: Sequence[Seen],
+    where: Sequence[CameraPose],
+    recall: RecallModel = _SIZE,
+    visible_only: bool = False,
+) -> Observed:
+    """The same from what each camera, at `where`, made of scenario `name`."""
     rates = [_recall(s, recall, visible_only) for s in seen]
     xy, area = seen[0].observed_m, seen[0].area_px2
     for pose, other in zip(where[1:], seen[1:], strict=True):
@@ -99,7 +110,7 @@ def observe(
         xy = np.where(larger[..., None], moved, xy)
         area = np.maximum(area, other.area_px2)
     missed = np.prod([1 - rate for rate in rates], axis=0)
-    return Observed(scenario.name, xy, 1 - missed, seen[0].present, seen[0].kind)
+    return Observed(name, xy, 1 - missed, seen[0].present, seen[0].kind)
 
 
 def _recall(seen: Seen, recall: RecallModel, visible_only: bool) -> FloatArray:

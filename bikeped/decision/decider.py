@@ -10,6 +10,7 @@ from bikeped.decision.rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRo
 from bikeped.decision.rules import PairVerdicts, RuleSettings, judge
 from bikeped.decision.stages import remembered, resolve
 from bikeped.types import (
+    BoolArray,
     Decision,
     FloatArray,
     IntArray,
@@ -46,25 +47,26 @@ class Decider:
             np.asarray([np.count_nonzero(verdicts.fires) > 0]),
         )
         state = State(code.item())
-        pair = _chosen(state, rows, pairs, verdicts, self.settings)
+        index = chosen_pair(state, verdicts.fires, verdicts.distance_m)
+        pair = None if index is None else pair_numbers(index, rows, pairs, verdicts, self.settings)
         sentence = explain(state, pair, pedestrians, time_s - self._last_cyclist_s, self.settings)
         return Decision(time_s, state, sentence, pair)
 
 
-def _chosen(
-    state: State,
-    rows: TrackRows,
-    pairs: Pairs,
-    verdicts: PairVerdicts,
-    settings: RuleSettings,
-) -> PairNumbers | None:
-    """The first pair in track order that fired (ALERT), or the nearest pair (WARNING)."""
+def chosen_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int | None:
+    """Whom a frame's decision is about, of its pairs: the first in track order that fired (ALERT),
+    or the nearest (WARNING)."""
     if state is State.ALERT:
-        index = int(np.argmax(verdicts.fires))
-    elif state is State.WARNING and len(verdicts.distance_m):
-        index = int(np.argmin(verdicts.distance_m))
-    else:
-        return None
+        return int(np.argmax(fires))
+    if state is State.WARNING and len(distance_m):
+        return int(np.argmin(distance_m))
+    return None
+
+
+def pair_numbers(
+    index: int, rows: TrackRows, pairs: Pairs, verdicts: PairVerdicts, settings: RuleSettings
+) -> PairNumbers:
+    """The figures by which pair `index` was judged."""
     return PairNumbers(
         cyclist_id=int(rows.id[pairs.cyclist_row[pairs.cyclist[index]]]),
         pedestrian_id=int(rows.id[pairs.pedestrian_row[index]]),

@@ -52,11 +52,19 @@ class PairVerdicts:
     """What the rule says of each pair [m], and the numbers that made it say so.
 
     `judged` is false for pairs out of range, out of bounds or without an earlier position; they
-    have a lookback of 0 s and no displacement.
+    have a lookback of 0 s and no displacement. A pair fires when it is judged and passes all tests:
+    `far_enough` (d_min), `near_enough` (d_max), `in_range` of the camera, `closing`, and `enough`
+    (the cyclist moved enough; rule ttc: soon together; rule distance: always). The last two are
+    false for pairs that are not judged.
     """
 
     fires: BoolArray
     judged: BoolArray
+    far_enough: BoolArray
+    near_enough: BoolArray
+    in_range: BoolArray
+    closing: BoolArray
+    enough: BoolArray
     distance_m: FloatArray
     distance_then_m: FloatArray
     lookback_s: FloatArray
@@ -83,30 +91,32 @@ def judge(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairVerdicts
         d_max = np.maximum(
             d_max, stopping_distance(speed, settings.reaction_s, settings.deceleration_mps2)
         )
-    near = (
-        (distance >= settings.d_min_m)
-        & (distance <= d_max)
-        & (_length(c_now) <= settings.max_range_m)
-        & (_length(p_now) <= settings.max_range_m)
-    )
+    far_enough, near_enough = distance >= settings.d_min_m, distance <= d_max
+    in_range = (_length(c_now) <= settings.max_range_m) & (_length(p_now) <= settings.max_range_m)
+    near = far_enough & near_enough & in_range
     # Only these are looked up in the past: of thousands of pairs in a crowd few are within bounds.
     index = near.nonzero()[0]
     c_then, p_then, elapsed = _look_back(
         rows, cyclist[index], pedestrian[index], settings.lookback_s
     )
-    fires, then, displacement = _close_in(
+    closes, passes, then, displacement = _close_in(
         settings, distance[index], c_now[index], p_now[index], c_then, p_then, elapsed
     )
 
     count = len(pairs)
     distance_then, lookback, way = distance.copy(), np.zeros(count), np.zeros(count)
     distance_then[index], lookback[index], way[index] = then, elapsed, displacement
-    fired = np.zeros(count, np.bool_)
     judged = lookback > 0
-    fired[index] = fires & judged[index]
+    closing, enough = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    closing[index], enough[index] = closes & judged[index], passes & judged[index]
     return PairVerdicts(
-        fires=fired,
+        fires=closing & enough,
         judged=judged,
+        far_enough=far_enough,
+        near_enough=near_enough,
+        in_range=in_range,
+        closing=closing,
+        enough=enough,
         distance_m=distance,
         distance_then_m=distance_then,
         lookback_s=lookback,
@@ -124,20 +134,22 @@ def _close_in(
     c_then: FloatArray,
     p_then: FloatArray,
     elapsed: FloatArray,
-) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """The rule itself: which pairs fire, the old distance it compared with, the cyclist's way."""
+) -> tuple[BoolArray, BoolArray, FloatArray, FloatArray]:
+    """The rule itself: which pairs close in, which pass its second test (they fire when they do
+    both), the old distance it compared with, the cyclist's way."""
     then = _length(c_then - p_then)
     displacement = _length(c_now - c_then)
     if settings.rule == "distance":
-        return np.ones(len(distance), np.bool_), then, displacement
+        always = np.ones(len(distance), np.bool_)
+        return always, always, then, displacement
     if settings.rule == "ttc":
         closing = (then - distance) / np.maximum(elapsed, EPSILON_S)
         soon = distance < settings.ttc_s * closing
-        return (closing > TTC_CLOSING_MIN_MPS) & soon, then, displacement
+        return closing > TTC_CLOSING_MIN_MPS, soon, then, displacement
     if settings.rule == "naive":
         then = _length(c_then - p_now)  # the pedestrian's old position is left out: its flaw
     closer = distance < then - EPSILON_M
-    return closer & (displacement > settings.min_displacement_m), then, displacement
+    return closer, displacement > settings.min_displacement_m, then, displacement
 
 
 def _length(vector: FloatArray) -> FloatArray:
