@@ -22,7 +22,13 @@ def command(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
 
     root = logging.getLogger()
     root.setLevel(min(root.level, logging.INFO))
-    status = run_service(load_config(config_path, overrides))
+    loaded = load_config(config_path, overrides)
+    pages = None
+    if loaded.config.web.enabled:
+        from bikeped.web.service import ServicePages
+
+        pages = ServicePages(loaded)
+    status = run_service(loaded, pages=pages)
     # Everything is stopped and the light is dark. A thread that is stuck in a driver must not keep
     # the process: leave without joining it.
     logging.shutdown()

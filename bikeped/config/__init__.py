@@ -26,6 +26,7 @@ from bikeped.config.sections_output import (
     SoundConfig,
     UsbConfig,
     WebConfig,
+    is_loopback,
 )
 
 __all__ = [
@@ -48,6 +49,7 @@ __all__ = [
     "default_config_path",
     "framing",
     "ground_camera",
+    "is_loopback",
     "known_keys",
     "load_calibration",
     "load_config",

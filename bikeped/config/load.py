@@ -15,6 +15,7 @@ import yaml
 
 from bikeped.config.calibration import Calibration, load_calibration
 from bikeped.config.sections import Config
+from bikeped.config.sections_output import is_loopback
 from bikeped.errors import ConfigError
 
 _MAX_BYTES = 1_000_000
@@ -233,6 +234,7 @@ _PATH_KEYS = frozenset(
         "mqtt.ca_file",
         "mqtt.cert_file",
         "mqtt.key_file",
+        "web.token_file",
         "audit.path",
     }
 )
@@ -341,7 +343,7 @@ def _value_at(data: Any, key: str) -> Any:
 
 def _cross_check(config: Config, where: str) -> None:
     """What no single key can say."""
-    decision, camera, mqtt = config.decision, config.camera, config.mqtt
+    decision, camera, mqtt, web = config.decision, config.camera, config.mqtt, config.web
     if decision.d_min_m > decision.d_max_m:
         raise ConfigError(
             f"{where}: decision.d_min_m: {decision.d_min_m:g} is above decision.d_max_m "
@@ -360,6 +362,11 @@ def _cross_check(config: Config, where: str) -> None:
     if (mqtt.cert_file is None) != (mqtt.key_file is None):
         raise ConfigError(
             f"{where}: mqtt.cert_file and mqtt.key_file: one without the other; set both"
+        )
+    if web.enabled and web.token_file is None and not is_loopback(web.host):
+        raise ConfigError(
+            f"{where}: web.host: {_one_line(web.host)} can be reached by others, who would see the "
+            "camera's picture; set web.token_file too, or web.host: 127.0.0.1"
         )
 
 

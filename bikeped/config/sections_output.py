@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from typing import Annotated, Literal
 
 import msgspec
@@ -141,12 +142,54 @@ class MqttConfig(Section, frozen=True):
     ] = "homeassistant"
 
 
-class WebConfig(Section, frozen=True):
-    """The HTTP server."""
+def is_loopback(host: str) -> bool:
+    """Whether `host`, a name or an address, is reachable from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
 
-    enabled: Annotated[bool, Meta(description="serve /metrics and /healthz")] = False
-    host: Annotated[str, Meta(min_length=1, description="address to bind")] = "127.0.0.1"
+
+class WebConfig(Section, frozen=True):
+    """The HTTP server: the pages for people, `/metrics` and `/healthz`."""
+
+    enabled: Annotated[bool, Meta(description="serve the pages, /metrics and /healthz")] = False
+    host: Annotated[
+        str,
+        Meta(
+            min_length=1,
+            description="address to bind; any but this machine's own (127.0.0.1, ::1, localhost) "
+            "needs web.token_file",
+        ),
+    ] = "127.0.0.1"
     port: Annotated[int, Meta(ge=0, le=65535, description="port to bind; 0: any free one")] = 8080
+    token_file: Annotated[
+        str | None,
+        Meta(
+            description="file whose first line is the token or password, 12 characters or more, "
+            "that everything but the login page asks for; null: none"
+        ),
+    ] = None
+    allowed_hosts: Annotated[
+        tuple[str, ...],
+        Meta(
+            max_length=32,
+            description="further names under which browsers may open the pages, e.g. pole7.lan",
+        ),
+    ] = ()
+    max_connections: Annotated[
+        int, Meta(ge=4, le=1000, description="open connections; more are turned away")
+    ] = 64
+    max_viewers: Annotated[
+        int, Meta(ge=1, le=100, description="live pages at a time; more are turned away")
+    ] = 8
+    stream_fps: Annotated[
+        float,
+        Meta(gt=0, le=30, description="pictures per second of the live page, while someone looks"),
+    ] = 10.0
+    stream_width: Annotated[
+        int, Meta(ge=160, le=3840, description="width of the live page's picture, pixels")
+    ] = 960
 
 
 class AuditConfig(Section, frozen=True):

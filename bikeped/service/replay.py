@@ -21,12 +21,14 @@ from bikeped.service.feed import RecordedFeed
 from bikeped.service.health import tell_health
 from bikeped.service.judge import Judge
 from bikeped.service.loop import Loop, Output
+from bikeped.service.pages import Inside, Pages, open_pages
 from bikeped.service.parts import header_of, load_eye, start_publisher
 from bikeped.service.recording import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
 from bikeped.service.telemetry import Telemetry
 from bikeped.service.vision import Eye, Vision
 from bikeped.telemetry.latency import StageTimes
-from bikeped.telemetry.messages import Part
+from bikeped.telemetry.messages import HealthMessage, Part
+from bikeped.telemetry.metrics import Metrics
 from bikeped.view import VideoSink
 
 log = logging.getLogger(__name__)
@@ -92,10 +94,12 @@ def replay(
     realtime: bool = False,
     mqtt: bool = True,
     progress: Callable[[int], None] | None = None,
+    pages: Pages | None = None,
 ) -> ReplayResult:
     """Runs a recording through the loop; raises BikepedError with one line that says the mend.
 
     `eye` in place of the configured model belongs to the recording, so its size is no surprise.
+    `pages` are served while it runs.
     """
     camera = loaded.config.camera
     source = open_source(
@@ -121,6 +125,7 @@ def replay(
                 mqtt and loaded.config.mqtt.enabled,
                 [] if progress is None else [Progress(progress)],
                 warnings,
+                pages,
             )
         )
 
@@ -134,13 +139,18 @@ async def _replay(
     mqtt: bool,
     outputs: list[Output],
     warnings: list[str],
+    pages: Pages | None,
 ) -> ReplayResult:
     config = loaded.config
     tally = Tally()
     async with contextlib.AsyncExitStack() as stack:
         publisher = await start_publisher(loaded, stack) if mqtt else None
-        telemetry = Telemetry(loaded, judge, publisher=publisher, remember=REMEMBER)
-        outputs = [tally, telemetry, *outputs]
+        metrics = Metrics() if pages is not None else None
+        telemetry = Telemetry(
+            loaded, judge, publisher=publisher, metrics=metrics, remember=REMEMBER
+        )
+        watchers = [] if pages is None else [pages]
+        outputs = [tally, telemetry, *outputs, *watchers]
         if files.events is not None:
             outputs.append(stack.enter_context(EventFile(files.events, header_of(loaded, eye))))
         if files.overlay is not None:
@@ -162,15 +172,29 @@ async def _replay(
             vision=Vision(eye, OVERLAY_SIZE[0] if files.overlay is not None else 0),
             judge=judge,
             announcer=Announcer(
-                SignalLogic.from_config(config.feedback), light, listeners=(telemetry,)
+                SignalLogic.from_config(config.feedback), light, listeners=(telemetry, *watchers)
             ),
             outputs=outputs,
         )
         part = Part(ok=True, detail="simulated")
-        telling = asyncio.create_task(
-            tell_health(
-                telemetry, loop, lambda: telemetry.health(loop, part), config.mqtt.health_interval_s
+
+        def health() -> HealthMessage:
+            return telemetry.health(loop, part)
+
+        if pages is not None and metrics is not None:
+            inside = Inside(
+                loaded=loaded,
+                judge=judge,
+                detector=eye.name,
+                health=health,
+                metrics=metrics.registry,
+                mqtt=None if publisher is None else lambda: publisher.status,
             )
+            server = await open_pages(pages, inside, config.web, stack)
+            if server.error is not None:
+                raise BikepedError(server.error)
+        telling = asyncio.create_task(
+            tell_health(telemetry, loop, health, config.mqtt.health_interval_s)
         )
         # Only now, when nothing more can be refused: an error is one line on its own.
         for text in warnings:
@@ -182,7 +206,7 @@ async def _replay(
         finally:
             telling.cancel()
         wall_s = time.perf_counter() - began
-        telemetry.publish_health(telemetry.health(loop, part))
+        telemetry.publish_health(health())
         if loop.counts.frames == 0:
             raise BikepedError(
                 f"{source.name}: no frame could be read ({loop.counts.undecodable} did not "

@@ -21,13 +21,13 @@ from bikeped.service.feed import LiveFeed
 from bikeped.service.health import tell_health
 from bikeped.service.judge import Judge
 from bikeped.service.loop import Hung, Limits, Loop
+from bikeped.service.pages import Inside, Pages, open_pages
 from bikeped.service.parts import header_of, load_eye, start_publisher
 from bikeped.service.systemd import Notifier
-from bikeped.service.telemetry import Telemetry, as_mapping
+from bikeped.service.telemetry import Telemetry
 from bikeped.service.vision import Eye, Vision
 from bikeped.service.workers import Worker
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.http import HttpServer, make_app
 from bikeped.telemetry.messages import HealthMessage, Part
 from bikeped.telemetry.metrics import Metrics
 
@@ -40,16 +40,18 @@ LOAD_LIMIT_S = 1800.0
 _REFRESH_S = 0.25
 
 
-def run_service(loaded: LoadedConfig, *, eye: Eye | None = None) -> int:
+def run_service(loaded: LoadedConfig, *, eye: Eye | None = None, pages: Pages | None = None) -> int:
     """The service until SIGTERM or SIGINT; its exit status: 0, or EXIT_RESTART.
+
+    `pages` is what `web` serves; None serves nothing.
 
     Raises BikepedError for what only a person can mend. A thread that hangs is left behind, so the
     caller should end the process without joining threads (see `bikeped.cli.run`).
     """
-    return asyncio.run(_run(loaded, eye))
+    return asyncio.run(_run(loaded, eye, pages))
 
 
-async def _run(loaded: LoadedConfig, eye: Eye | None) -> int:
+async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> int:
     stop = asyncio.Event()
     for number in (signals.SIGTERM, signals.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -78,7 +80,7 @@ async def _run(loaded: LoadedConfig, eye: Eye | None) -> int:
             return 0
         log.info("detector: %s, sha256 %s", eye.name, eye.model_hash or "none")
         async with contextlib.AsyncExitStack() as stack:
-            return await _serve(loaded, judge, eye, light, notifier, stop, stack, last)
+            return await _serve(loaded, judge, eye, light, notifier, stop, stack, last, pages)
 
 
 async def _serve(
@@ -90,6 +92,7 @@ async def _serve(
     stop: asyncio.Event,
     stack: contextlib.AsyncExitStack,
     last: contextlib.AsyncExitStack,
+    pages: Pages | None,
 ) -> int:
     """Starts every part, watches until `stop`; what `stack` unwinds comes before `last`."""
     config, camera = loaded.config, loaded.config.camera
@@ -101,10 +104,11 @@ async def _serve(
         audit = AuditLog(config.audit, header_of(loaded, eye), base_dir=loaded.base_dir)
         audit.start()
         stack.push_async_callback(asyncio.to_thread, audit.close)
-    metrics = Metrics() if config.web.enabled else None
+    metrics = Metrics() if pages is not None else None
+    watchers = () if pages is None else (pages,)
     telemetry = Telemetry(loaded, judge, publisher=publisher, audit=audit, metrics=metrics)
     announcer = Announcer(
-        SignalLogic.from_config(config.feedback), light, speaker, listeners=(telemetry,)
+        SignalLogic.from_config(config.feedback), light, speaker, listeners=(telemetry, *watchers)
     )
     grabber = FrameGrabber(partial(_open_camera, loaded), stale_after_s=camera.stale_after_s)
     grabber.start()
@@ -113,7 +117,7 @@ async def _serve(
         vision=Vision(eye),
         judge=judge,
         announcer=announcer,
-        outputs=(telemetry,),
+        outputs=(telemetry, *watchers),
         limits=Limits(
             stale_after_s=camera.stale_after_s,
             silent_after_s=config.detection.silent_after_s,
@@ -131,11 +135,16 @@ async def _serve(
         part = Part(ok=light.fault is None, detail=light.fault or config.feedback.light)
         return telemetry.health(loop, part, tuple(faults))
 
-    if metrics is not None:
-        app = make_app(metrics.registry, lambda: as_mapping(health()), host=config.web.host)
-        server = HttpServer(app, config.web)
-        await server.start()
-        stack.push_async_callback(server.stop)
+    if pages is not None and metrics is not None:
+        inside = Inside(
+            loaded=loaded,
+            judge=judge,
+            detector=eye.name,
+            health=health,
+            metrics=metrics.registry,
+            mqtt=None if publisher is None else lambda: publisher.status,
+        )
+        await open_pages(pages, inside, config.web, stack)
     tasks = (
         asyncio.create_task(_stop_when(stop, loop)),
         asyncio.create_task(

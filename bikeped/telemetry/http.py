@@ -1,11 +1,10 @@
-"""`/metrics` and `/healthz` over HTTP."""
+"""`/metrics` and `/healthz` over HTTP, and the server that they and the pages share."""
 
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, get_args
 
 import msgspec
@@ -19,32 +18,21 @@ from bikeped.telemetry.messages import ShownState
 log = logging.getLogger(__name__)
 
 Health = Callable[[], Mapping[str, Any]]
-_Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 _WELL = frozenset(get_args(ShownState)) - {"FAULT"}
+#: A connection on which nothing is asked for so long is closed: it takes another's place.
+IDLE_S = 20.0
+#: How long the rest of a refused body is thrown away unread, so that the sender gets the answer.
+_LINGER_S = 0.5
+_BACKLOG = 32
 
 
-def make_app(
-    registry: CollectorRegistry,
-    health: Health,
-    *,
-    host: str = "127.0.0.1",
-    allowed_hosts: tuple[str, ...] = (),
-    client_max_size: int = 64 * 1024,
-) -> web.Application:
-    """The application with `/metrics` and `/healthz`, to which pages may be added.
+def add_monitoring(app: web.Application, registry: CollectorRegistry, health: Health) -> None:
+    """Adds `/metrics` (Prometheus) and `/healthz` to an application.
 
     `health` returns the health message as a mapping; without a `state` that is known and not FAULT,
-    or when it raises, `/healthz` answers 503. Bound to a loopback `host`, requests must name this
-    machine (or one of `allowed_hosts`) in their Host header: otherwise any web page could have a
-    visitor's browser read the pole under a name of its own (DNS rebinding). Bound elsewhere the
-    owner has chosen to be reachable, under names that only he knows.
+    or when it raises, `/healthz` answers 503.
     """
-    middlewares = []
-    if is_loopback(host):
-        names = {"localhost", "127.0.0.1", "::1", host.lower(), *map(str.lower, allowed_hosts)}
-        middlewares.append(_only_hosts(frozenset(names)))
-    app = web.Application(middlewares=middlewares, client_max_size=client_max_size)
 
     async def metrics(request: web.Request) -> web.Response:
         encode, content_type = choose_encoder(request.headers.get("Accept", ""))
@@ -70,11 +58,10 @@ def make_app(
 
     app.router.add_get("/metrics", metrics)
     app.router.add_get("/healthz", healthz)
-    return app
 
 
 class HttpServer:
-    """Serves an application at `config.host` and `config.port`.
+    """Serves an application at `config.host` and `config.port`, to `config.max_connections`.
 
     A port that cannot be bound is a line in `error`, never the end of the service.
     """
@@ -83,44 +70,70 @@ class HttpServer:
         self._app = app
         self._config = config
         self._runner: web.AppRunner | None = None
+        self._server: asyncio.Server | None = None
         self.error: str | None = None  #: why it is not serving, one line with the mend
         self.port: int | None = None  #: the port it serves; None while it does not
 
     async def start(self) -> bool:
         """Binds and serves; whether that worked. After a failure the application may not be reused:
         make a new one to try again."""
-        # No access log: a scrape every few seconds for months is not news.
-        runner = web.AppRunner(self._app, access_log=None, shutdown_timeout=1.0)
+        config = self._config
+        runner = web.AppRunner(
+            self._app,
+            access_log=None,  # a scrape every few seconds for months is not news
+            shutdown_timeout=1.0,
+            keepalive_timeout=IDLE_S,
+            lingering_time=_LINGER_S,
+        )
         await runner.setup()
+        accept = runner.server
+        if accept is None:  # pragma: no cover - set by setup()
+            raise RuntimeError("the application is not set up")
+
+        def door() -> asyncio.BaseProtocol:
+            full = len(accept.connections) >= config.max_connections
+            return _TurnAway() if full else accept()
+
         try:
-            await web.TCPSite(runner, self._config.host, self._config.port).start()
+            self._server = await asyncio.get_running_loop().create_server(
+                door, config.host, config.port, backlog=_BACKLOG
+            )
         except OSError as exc:
             await runner.cleanup()
             self.error = (
-                f"cannot serve http://{self._config.host}:{self._config.port} "
+                f"cannot serve http://{config.host}:{config.port} "
                 f"({exc.strerror or exc}): set web.host and web.port to a free one of this machine"
             )
             log.error("web: %s", self.error)
             return False
         self._runner = runner
         self.error = None
-        self.port = int(runner.addresses[0][1])
-        log.info("web: serving http://%s:%d", self._config.host, self.port)
+        self.port = int(self._server.sockets[0].getsockname()[1])
+        log.info("web: serving http://%s:%d", config.host, self.port)
         return True
 
     async def stop(self) -> None:
         """Stops serving; open requests get a second to end."""
         runner, self._runner, self.port = self._runner, None, None
+        if self._server is not None:
+            self._server.close()
+            self._server = None
         if runner is not None:
             await runner.cleanup()
 
 
-def is_loopback(host: str) -> bool:
-    """Whether `host`, a name or an address, is reachable from this machine only."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
+class _TurnAway(asyncio.Protocol):
+    """One connection too many: one answer and the door."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if isinstance(transport, asyncio.WriteTransport):
+            text = b"Too many connections are open: close a page, or try again later.\n"
+            transport.write(
+                b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain\r\n"
+                b"Retry-After: 5\r\nConnection: close\r\n"
+                b"Content-Length: %d\r\n\r\n%s" % (len(text), text)
+            )
+        transport.close()
 
 
 def host_name(header: str) -> str:
@@ -129,13 +142,3 @@ def host_name(header: str) -> str:
     if name.startswith("["):
         return name[1:].partition("]")[0]
     return name.partition(":")[0]
-
-
-def _only_hosts(names: frozenset[str]) -> Any:
-    @web.middleware
-    async def check(request: web.Request, handler: _Handler) -> web.StreamResponse:
-        if host_name(request.headers.get("Host", "")) not in names:
-            raise web.HTTPForbidden(text="This Host is not allowed: open http://localhost instead.")
-        return await handler(request)
-
-    return check

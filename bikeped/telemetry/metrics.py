@@ -25,7 +25,7 @@ DROP_REASONS = ("newer", "queue", "stale")
 
 
 class Metrics:
-    """All metrics of one service, named `bikeped_...`; serve `registry` with `http.make_app`."""
+    """All metrics of one service, named `bikeped_...`; `http.add_monitoring` serves `registry`."""
 
     def __init__(self, registry: CollectorRegistry | None = None) -> None:
         self.registry = registry or CollectorRegistry()

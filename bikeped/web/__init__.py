@@ -1,1 +1,21 @@
-"""The pages on the box: live view, alignment and the test bench."""
+"""The pages: live view, alignment, test bench; plain HTML, CSS and modules, no build step.
+
+How a page is made. Each page is a module with one function that adds it to an application:
+
+    add_live(app, live)                      bikeped/web/live.py
+    add_align(app, ...)                      bikeped/web/align.py
+    add_testbench(app, ...)                  bikeped/web/testbench.py
+
+It calls `server.add_page(app, Page("/align", "Align", ...))`, which serves `static/<body>.html`
+inside the common frame with its entry in the navigation, and adds its own routes below the page's
+path (`/align/...`). `server.make_pages(access, *adders)` makes the application: each adder is
+called with it, and every request goes through `security`. What is in `static/` is served as
+`/static/<name>`; scripts are modules that import `/static/ui.js`.
+
+The content security policy allows nothing inline: no `style="..."`, no `onclick`, no `innerHTML`
+with text (use `el` of ui.js). Handlers raise BikepedError for bad input: the caller gets status 400
+and `{"error": "..."}`. Slow computations go to `asyncio.to_thread`.
+
+`bikeped run` shows live and align; the test bench needs the simulation and runs on its own
+(`bikeped testbench`). No page changes a threshold of the running service.
+"""

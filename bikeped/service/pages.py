@@ -1,0 +1,48 @@
+"""The seam to the pages: the service shows them what it does, and knows nothing of them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from aiohttp import web
+from prometheus_client import CollectorRegistry
+
+from bikeped.config import LoadedConfig, WebConfig
+from bikeped.service.announcer import SignalListener
+from bikeped.service.judge import Judge
+from bikeped.service.loop import Output
+from bikeped.telemetry.http import HttpServer
+from bikeped.telemetry.messages import HealthMessage
+from bikeped.telemetry.mqtt import MqttStatus
+
+
+@dataclass(frozen=True)
+class Inside:
+    """What pages may look at. Nothing here changes what the service does."""
+
+    loaded: LoadedConfig
+    judge: Judge
+    detector: str
+    health: Callable[[], HealthMessage]
+    metrics: CollectorRegistry
+    mqtt: Callable[[], MqttStatus] | None  #: None: no broker is configured
+
+
+class Pages(Output, SignalListener, Protocol):
+    """Pages hear every outcome and every signal, put them aside, and return at once."""
+
+    def application(self, inside: Inside) -> web.Application:
+        """What is served, the monitoring included."""
+
+
+async def open_pages(
+    pages: Pages, inside: Inside, config: WebConfig, stack: contextlib.AsyncExitStack
+) -> HttpServer:
+    """Serves the pages until `stack` unwinds. A port that cannot be bound is in `error`."""
+    server = HttpServer(pages.application(inside), config)
+    await server.start()
+    stack.push_async_callback(server.stop)
+    return server

@@ -1,0 +1,271 @@
+"""Who may ask, and what: host names, origins, the token, body sizes, headers.
+
+One middleware, in this order: the Host must be one of this machine's names (DNS rebinding); another
+site's page may link here, but neither embed nor fetch nor post (Origin and Fetch Metadata); a body
+that is too large is refused unread; and where there is a token, it is asked for. A browser gives it
+once, on the login page or in a link `/?token=...`, and keeps a cookie; programs send
+`Authorization: Bearer TOKEN`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import socket
+import time
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from aiohttp import hdrs, web
+
+from bikeped.config import WebConfig, is_loopback
+from bikeped.errors import ConfigError
+from bikeped.telemetry.http import host_name
+
+COOKIE = "bikeped_session"
+SESSION_S = 7 * 24 * 3600
+SHORTEST_TOKEN = 12
+#: Bodies are settings and scenarios: text, never video.
+MAX_BODY = 1024 * 1024
+#: Open to those who have not logged in: what the login page is made of.
+_OPEN = ("/login", "/static/")
+_SAFE_METHODS = frozenset({hdrs.METH_GET, hdrs.METH_HEAD, hdrs.METH_OPTIONS})
+
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+        "connect-src 'self'; font-src 'self'; form-action 'self'; base-uri 'none'; "
+        "frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=()",
+}
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who is let in.
+
+    `names`: host names that are answered to; `any_address`: so is every plain address, which no
+    foreign name can stand for. `token` None: whoever reaches the port is let in.
+    """
+
+    names: frozenset[str]
+    any_address: bool = False
+    token: str | None = field(default=None, repr=False)
+
+    def knows_host(self, header: str) -> bool:
+        """Whether a Host header names this machine."""
+        name = host_name(header)
+        return name in self.names or (self.any_address and _is_address(name))
+
+    def is_token(self, given: str) -> bool:
+        """Whether `given` is the token; takes the same time for every wrong one."""
+        if self.token is None:
+            return False
+        return hmac.compare_digest(_digest(given), _digest(self.token))
+
+    def new_cookie(self, now_s: float) -> str:
+        """A session's cookie. It outlives a restart, and ends when the token is changed."""
+        expires = f"{now_s + SESSION_S:.0f}"
+        return f"{expires}.{self._sign(expires)}"
+
+    def is_cookie(self, cookie: str, now_s: float) -> bool:
+        """Whether a cookie is one of ours and not expired."""
+        expires, _, signature = cookie.partition(".")
+        if self.token is None or not (expires.isascii() and expires.isdigit()):
+            return False
+        right = hmac.compare_digest(_digest(signature), _digest(self._sign(expires)))
+        return right and len(expires) < 16 and now_s < float(expires)
+
+    def _sign(self, text: str) -> str:
+        key = (self.token or "").encode()
+        return hmac.new(key, f"bikeped session {text}".encode(), hashlib.sha256).hexdigest()
+
+
+def open_access(config: WebConfig, base_dir: Path = Path(), source: str = "web") -> Access:
+    """Who is let in by this configuration; `source` names it in errors.
+
+    Raises ConfigError when others could reach the pages without a token, or when the token's file
+    cannot be used.
+    """
+    local = is_loopback(config.host)
+    token = None
+    if config.token_file is not None:
+        token = _read_token(base_dir / Path(config.token_file).expanduser())
+    elif not local:
+        raise ConfigError(
+            f"{source}: web.host: {config.host} can be reached by others, who would see the "
+            "camera's picture; set web.token_file too, or web.host: 127.0.0.1"
+        )
+    names = {"localhost", "127.0.0.1", "::1", *config.allowed_hosts}
+    if not _is_address(config.host) or local:
+        names.add(config.host)
+    if not local:
+        own = socket.gethostname()
+        names |= {own, f"{own.partition('.')[0]}.local"}
+    return Access(frozenset(map(str.lower, names)), any_address=not local, token=token)
+
+
+def _read_token(path: Path) -> str:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: web.token_file cannot be read ({error.strerror}); give a file that the "
+            "service may read"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{path}: web.token_file is not UTF-8 text; write the token as its first line"
+        ) from error
+    token = text.partition("\n")[0].strip()
+    if len(token) < SHORTEST_TOKEN:
+        raise ConfigError(
+            f"{path}: web.token_file: its first line has {len(token)} characters and could be "
+            f"guessed; write {SHORTEST_TOKEN} or more, e.g. from: openssl rand -hex 16"
+        )
+    return token
+
+
+class Failures:
+    """Wrong tokens of the last minute, by address and in all; bounded."""
+
+    def __init__(
+        self,
+        per_address: int = 6,
+        overall: int = 100,
+        window_s: float = 60.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._per_address, self._overall, self._window_s = per_address, overall, window_s
+        self._clock = clock
+        self._by_address: OrderedDict[str, list[float]] = OrderedDict()
+
+    def count(self, address: str) -> None:
+        """One more wrong token from `address`."""
+        times = self._recent(self._by_address.pop(address, []))
+        self._by_address[address] = [*times, self._clock()][-self._per_address :]
+        while len(self._by_address) > self._overall:
+            self._by_address.popitem(last=False)
+
+    def wait_s(self, address: str) -> float:
+        """How long `address` must wait before its token is looked at again; 0: not at all."""
+        mine = self._recent(self._by_address.get(address, []))
+        if len(mine) >= self._per_address:
+            return mine[0] + self._window_s - self._clock()
+        everyone = sorted(t for times in self._by_address.values() for t in self._recent(times))
+        if len(everyone) >= self._overall:
+            return everyone[-self._overall] + self._window_s - self._clock()
+        return 0.0
+
+    def _recent(self, times: list[float]) -> list[float]:
+        since_s = self._clock() - self._window_s
+        return [t for t in times if t > since_s]
+
+
+def guard(access: Access, login: Callable[[web.Request], web.Response], failures: Failures) -> Any:
+    """The middleware. `login` makes the answer to a person who has no session yet."""
+
+    @web.middleware
+    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+        if not access.knows_host(request.headers.get(hdrs.HOST, "")):
+            raise web.HTTPForbidden(
+                text="This Host is not allowed: open the pages by this machine's address or as "
+                "http://localhost, or name the host in web.allowed_hosts."
+            )
+        if not _from_here(request):
+            raise web.HTTPForbidden(text="Another site may not do this: open the page itself.")
+        if (request.content_length or 0) > MAX_BODY:
+            raise web.HTTPRequestEntityTooLarge(
+                max_size=MAX_BODY,
+                actual_size=request.content_length or 0,
+                headers={hdrs.CONNECTION: "close"},
+            )
+        if access.token is None or request.path.startswith(_OPEN):
+            return await handler(request)
+        if access.is_cookie(request.cookies.get(COOKIE, ""), time.time()):
+            return await handler(request)
+        scheme, _, given = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
+        if scheme.lower() == "bearer":
+            try_token(access, failures, request, given.strip())
+            return await handler(request)
+        return login(request)
+
+    return check
+
+
+def try_token(access: Access, failures: Failures, request: web.Request, given: str) -> None:
+    """Raises HTTPTooManyRequests or HTTPUnauthorized unless `given` is the token."""
+    address = _neighbourhood(request.remote or "")
+    wait_s = failures.wait_s(address)
+    if wait_s > 0:
+        raise web.HTTPTooManyRequests(
+            text=f"Too many wrong tokens: try again in {wait_s:.0f} s.",
+            headers={hdrs.RETRY_AFTER: f"{wait_s:.0f}"},
+        )
+    if not access.is_token(given):
+        failures.count(address)
+        raise web.HTTPUnauthorized(
+            text="This token is not the one in web.token_file.",
+            headers={hdrs.WWW_AUTHENTICATE: "Bearer"},
+        )
+
+
+def _from_here(request: web.Request) -> bool:
+    """Whether the request is of our own pages, a person's, or a program's; not another site's."""
+    headers = request.headers
+    changes = request.method not in _SAFE_METHODS or hdrs.UPGRADE in headers
+    origin = headers.get(hdrs.ORIGIN)
+    if changes and origin is not None and not _same_place(origin, headers.get(hdrs.HOST, "")):
+        return False
+    site = headers.get("Sec-Fetch-Site")
+    if site is None or site == "same-origin":
+        return True
+    if changes:
+        return False
+    # A link may lead here; a picture, a script or a frame of another site may not.
+    opened = headers.get("Sec-Fetch-Mode") == "navigate"
+    return site == "none" or (opened and headers.get("Sec-Fetch-Dest") == "document")
+
+
+def _same_place(origin: str, host: str) -> bool:
+    try:
+        parts = urlsplit(origin)
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.strip().lower()
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _neighbourhood(address: str) -> str:
+    """An IPv4 address, or the /64 of an IPv6 address, all of which one visitor may have."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if found.version == 4:
+        return address
+    return str(ipaddress.ip_network((found, 64), strict=False))
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).digest()

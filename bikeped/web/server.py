@@ -1,0 +1,324 @@
+"""The application around the pages: their common frame, static files, login, errors."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import html
+import logging
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from aiohttp import hdrs, web
+
+from bikeped import __version__
+from bikeped.errors import BikepedError
+from bikeped.web.security import (
+    COOKIE,
+    HEADERS,
+    MAX_BODY,
+    SESSION_S,
+    Access,
+    Failures,
+    Handler,
+    guard,
+    try_token,
+)
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_STATIC = Path(__file__).with_name("static")
+_TYPES = {
+    ".html": "text/html",
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".json": "application/json",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".webp": "image/webp",
+    ".txt": "text/plain",
+}
+#: The order of the navigation.
+_ORDER = ("/", "/align", "/testbench")
+_BODY_S = 20.0  #: how long a body may take to arrive
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page: `path`, its `label` in the navigation, the `title` of its window.
+
+    `body` is a file of `static/`, the inside of <main>; `scripts` (modules) and `styles` are files
+    of `static/`, too, loaded after the common ones.
+    """
+
+    path: str
+    label: str
+    title: str
+    body: str
+    scripts: Sequence[str] = ()
+    styles: Sequence[str] = ()
+
+
+PAGES: web.AppKey[list[Page]] = web.AppKey("pages", list)
+_ACCESS: web.AppKey[Access] = web.AppKey("access", Access)
+_FILES: web.AppKey[dict[str, _File]] = web.AppKey("files", dict)
+
+
+@dataclass(frozen=True)
+class _File:
+    data: bytes
+    content_type: str
+    etag: str
+
+
+def make_pages(access: Access, *adders: Callable[[web.Application], None]) -> web.Application:
+    """The application: each of `adders` adds its page and routes to it."""
+    failures = Failures()
+
+    def login(request: web.Request) -> web.Response:
+        return _ask_for_token(request, access, failures)
+
+    app = web.Application(
+        middlewares=[guard(access, login, failures), _errors], client_max_size=MAX_BODY
+    )
+    app[PAGES], app[_ACCESS], app[_FILES] = [], access, _load_static()
+    app.on_response_prepare.append(_harden)
+    app.router.add_get("/static/{name:.+}", _static)
+    app.router.add_get("/favicon.ico", _favicon)
+    app.router.add_get("/session", _session)
+    app.router.add_get("/login", _login_form)
+
+    async def log_in(request: web.Request) -> web.Response:
+        return await _log_in(request, access, failures)
+
+    app.router.add_post("/login", log_in)
+    app.router.add_post("/logout", _log_out)
+    for add in adders:
+        add(app)
+    paths = [page.path for page in app[PAGES]]
+    if paths and "/" not in paths:
+        app.router.add_get("/", _to(paths[0]))
+    return app
+
+
+def add_page(app: web.Application, page: Page) -> None:
+    """Adds a page and its entry in the navigation."""
+    app[PAGES].append(page)
+    app[PAGES].sort(key=lambda p: _ORDER.index(p.path) if p.path in _ORDER else len(_ORDER))
+
+    async def show(request: web.Request) -> web.Response:
+        if "token" in request.query:  # has done its work, and must not stay in sight
+            raise web.HTTPFound(page.path)
+        return _page(request, page)
+
+    app.router.add_get(page.path, show)
+
+
+async def json_body(request: web.Request, kind: type[T]) -> T:
+    """The request's JSON as `kind` (a msgspec type); BikepedError, which the caller reads, else."""
+    if request.content_type != "application/json":
+        raise web.HTTPUnsupportedMediaType(text="Send JSON: Content-Type: application/json.")
+    try:
+        text = await asyncio.wait_for(request.read(), _BODY_S)
+    except asyncio.TimeoutError as error:
+        raise web.HTTPRequestTimeout(text="The request's body did not arrive.") from error
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BikepedError(f"request: {error}") from error
+
+
+def json_answer(data: Any, status: int = 200) -> web.Response:
+    """`data` (anything msgspec encodes) as JSON that nobody keeps."""
+    return web.Response(
+        status=status,
+        body=msgspec.json.encode(data),
+        content_type="application/json",
+        headers={hdrs.CACHE_CONTROL: "no-store"},
+    )
+
+
+@web.middleware
+async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
+    try:
+        return await handler(request)
+    except BikepedError as error:
+        return json_answer({"error": " ".join(str(error).split())}, 400)
+    except (web.HTTPException, asyncio.CancelledError, ConnectionError):
+        raise
+    except Exception:
+        log.exception("web: %s %s failed", request.method, request.path)
+        return json_answer({"error": "this is a bug in bikeped: its log says more"}, 500)
+
+
+async def _harden(_request: web.Request, response: web.StreamResponse) -> None:
+    for name, value in HEADERS.items():
+        response.headers.setdefault(name, value)
+    response.headers.setdefault(hdrs.CACHE_CONTROL, "no-store")
+    response.headers.popall(hdrs.SERVER, None)
+
+
+def _load_static() -> dict[str, _File]:
+    """All files of the pages, by name: what is not here is not served, whatever the path."""
+    files = {}
+    for path in sorted(_STATIC.rglob("*")):
+        if path.is_file() and path.suffix in _TYPES and not path.name.startswith("."):
+            data = path.read_bytes()
+            name = path.relative_to(_STATIC).as_posix()
+            etag = hashlib.sha256(data).hexdigest()[:20]
+            files[name] = _File(data, _TYPES[path.suffix], etag)
+    return files
+
+
+async def _static(request: web.Request) -> web.StreamResponse:
+    file = request.app[_FILES].get(request.match_info["name"])
+    if file is None or file.content_type == "text/html":
+        raise web.HTTPNotFound(text="There is no such file.")
+    return _answer_file(request, file)
+
+
+async def _favicon(request: web.Request) -> web.StreamResponse:
+    return _answer_file(request, request.app[_FILES]["icon.svg"])
+
+
+def _answer_file(request: web.Request, file: _File) -> web.StreamResponse:
+    # Asked for anew each time: after an update the pages must not run on yesterday's scripts.
+    headers = {hdrs.ETAG: f'"{file.etag}"', hdrs.CACHE_CONTROL: "no-cache"}
+    if any(tag.value == file.etag for tag in request.if_none_match or ()):
+        return web.Response(status=304, headers=headers)
+    charset = None if file.content_type.startswith("image/") else "utf-8"
+    return web.Response(
+        body=file.data, content_type=file.content_type, charset=charset, headers=headers
+    )
+
+
+def _page(request: web.Request, page: Page, status: int = 200) -> web.Response:
+    """`page` inside the common frame."""
+    files = request.app[_FILES]
+    links = ""
+    for entry in request.app[PAGES]:
+        here = ' aria-current="page"' if entry.path == page.path else ""
+        links += f'<a href="{html.escape(entry.path)}"{here}>{html.escape(entry.label)}</a>'
+    styles = "".join(f'<link rel="stylesheet" href="/static/{name}">' for name in page.styles)
+    scripts = "".join(
+        f'<script type="module" src="/static/{name}"></script>' for name in page.scripts
+    )
+    parts = {
+        "title": html.escape(page.title),
+        "nav": links,
+        "styles": styles,
+        "scripts": scripts,
+        "version": html.escape(__version__),
+        "body": files[page.body].data.decode(),
+    }
+    frame = files["frame.html"].data.decode()
+    text = re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], frame)
+    return web.Response(status=status, text=text, content_type="text/html")
+
+
+def _to(path: str) -> Handler:
+    async def redirect(_request: web.Request) -> web.StreamResponse:
+        raise web.HTTPFound(path)
+
+    return redirect
+
+
+# --- login
+
+_LOGIN = Page("/login", "Log in", "Log in", "login.html", scripts=("login.js",))
+_REFUSED = Page("/login", "Log in", "Log in: not the token", "login-refused.html")
+_WAIT = Page("/login", "Log in", "Log in: please wait", "login-wait.html")
+
+
+def _ask_for_token(request: web.Request, access: Access, failures: Failures) -> web.Response:
+    """The answer to somebody without a session: a link's token is taken, others are asked."""
+    wants_page = request.method == hdrs.METH_GET and "text/html" in request.headers.get(
+        "Accept", ""
+    )
+    if not wants_page:
+        raise web.HTTPUnauthorized(
+            text="A token is needed: log in, or send Authorization: Bearer TOKEN.",
+            headers={hdrs.WWW_AUTHENTICATE: "Bearer"},
+        )
+    if "token" not in request.query:
+        return _page(request, _LOGIN, 401)
+    refused = _refusal(request, access, failures, request.query["token"])
+    return refused or _welcome(request, access, request.path)
+
+
+def _refusal(
+    request: web.Request, access: Access, failures: Failures, given: str
+) -> web.Response | None:
+    """The page that says why `given` does not let a person in; None when it does."""
+    try:
+        try_token(access, failures, request, given)
+    except web.HTTPTooManyRequests as error:
+        answer = _page(request, _WAIT, error.status)
+        answer.headers[hdrs.RETRY_AFTER] = error.headers[hdrs.RETRY_AFTER]
+        return answer
+    except web.HTTPUnauthorized as error:
+        return _page(request, _REFUSED, error.status)
+    return None
+
+
+def _welcome(request: web.Request, access: Access, path: str) -> web.Response:
+    """Sets the cookie and leads on to `path`.
+
+    Not by a redirect: a browser that came here from another site (a link in a mail) does not send a
+    SameSite=Strict cookie along a chain that began there. A page of our own starts a new one.
+    """
+    target = html.escape(_local(path), quote=True)
+    answer = web.Response(
+        text=f'<!doctype html><html lang="en"><head><title>Welcome</title>'
+        f'<meta http-equiv="refresh" content="0;url={target}"></head>'
+        f'<body><a href="{target}">Continue</a></body></html>',
+        content_type="text/html",
+    )
+    answer.set_cookie(
+        COOKIE,
+        access.new_cookie(time.time()),
+        max_age=SESSION_S,
+        httponly=True,
+        samesite="Strict",
+        secure=request.secure,
+        path="/",
+    )
+    return answer
+
+
+async def _login_form(request: web.Request) -> web.Response:
+    return _page(request, _LOGIN)
+
+
+async def _log_in(request: web.Request, access: Access, failures: Failures) -> web.Response:
+    try:
+        form = await asyncio.wait_for(request.post(), _BODY_S)
+    except asyncio.TimeoutError as error:
+        raise web.HTTPRequestTimeout(text="The form did not arrive.") from error
+    token, path = form.get("token"), form.get("next")
+    refused = _refusal(request, access, failures, token if isinstance(token, str) else "")
+    return refused or _welcome(request, access, path if isinstance(path, str) else "/")
+
+
+async def _log_out(_request: web.Request) -> web.StreamResponse:
+    answer = web.HTTPSeeOther("/login")
+    answer.del_cookie(COOKIE, path="/")
+    raise answer
+
+
+async def _session(request: web.Request) -> web.StreamResponse:
+    """204 for whoever is let in; the guard has asked for the token."""
+    return web.Response(status=204)
+
+
+def _local(path: str) -> str:
+    """`path` if it leads to this server, else the first page."""
+    fine = re.fullmatch(r"/(?![/\\])[\w\-./]*", path, re.ASCII)
+    return path if fine and ".." not in path else "/"

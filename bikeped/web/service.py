@@ -1,0 +1,47 @@
+"""The pages of a running service: live view and alignment, with the monitoring beside them."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from aiohttp import web
+
+from bikeped.config import LoadedConfig
+from bikeped.service.loop import Outcome
+from bikeped.service.pages import Inside
+from bikeped.service.telemetry import as_mapping
+from bikeped.telemetry.http import add_monitoring
+from bikeped.types import Decision, Frame, Signal
+from bikeped.web.live import Live, add_live
+from bikeped.web.security import open_access
+from bikeped.web.server import make_pages
+from bikeped.web.watch import Watch
+
+
+class ServicePages:
+    """What `bikeped run` and `bikeped replay --web` serve.
+
+    Raises ConfigError when the configuration would let others in without a token.
+    """
+
+    def __init__(self, loaded: LoadedConfig) -> None:
+        self._access = open_access(loaded.config.web, loaded.base_dir, loaded.source)
+        self.watch = Watch()
+
+    async def frame(self, outcome: Outcome) -> None:
+        await self.watch.frame(outcome)
+
+    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+        self.watch.signal(signal, sentence, decision)
+
+    def application(self, inside: Inside) -> web.Application:
+        app = make_pages(
+            self._access,
+            partial(add_live, live=Live(self.watch, inside)),
+        )
+        add_monitoring(app, inside.metrics, lambda: as_mapping(inside.health()))
+        return app
+
+    def newest(self) -> Frame | None:
+        """The newest frame that was judged."""
+        return None if self.watch.outcome is None else self.watch.outcome.picture.frame

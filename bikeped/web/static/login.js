@@ -1,0 +1,7 @@
+// The form leads back to where the visitor wanted to go; who has a session already goes there at
+// once (a browser withholds the cookie from a link on another site, but not from our own page).
+const next = location.pathname === "/login" ? "/" : location.pathname;
+document.getElementById("next").value = next;
+document.getElementById("token").focus();
+const answer = await fetch("/session", { headers: { Accept: "text/plain" } }).catch(() => null);
+if (answer && answer.status === 204) location.replace(next);
