@@ -23,6 +23,8 @@ _INPUTS = {
     "curve_path": "--recall-curve",
     "data": "DATA",
     "models": "MODEL",
+    "picture": "FRAME",
+    "points_path": "--points",
 }
 _OUTPUTS = {
     "json_path": "--json",
@@ -32,6 +34,7 @@ _OUTPUTS = {
     "out": "--out",
     "figure": "--figure",
     "curve_out": "--curve",
+    "grid_path": "--grid",
 }
 
 

@@ -19,6 +19,7 @@ COMMANDS = {
     "demo": "bikeped.cli.demo",
     "config": "bikeped.cli.config",
     "doctor": "bikeped.cli.doctor",
+    "align": "bikeped.cli.align",
     "conformance": "bikeped.cli.conformance",
     "model": "bikeped.cli.model",
 }

@@ -16,6 +16,7 @@ from pathlib import Path
 import msgspec
 import yaml
 
+import bikeped
 from bikeped.config import load_config, parse_config
 from bikeped.config.load import load_yaml
 from bikeped.config.provenance import provenance_path
@@ -57,6 +58,10 @@ def why_not(path: Path) -> str | None:
     target = path.resolve()
     if not target.is_file():
         return f"{path}: is not there; start with -c and a file of your own"
+    if target.parent == Path(bikeped.__file__).parent.resolve() / "default":
+        return (
+            f"{path}: comes with bikeped and stays as it is; start with -c and a file of your own"
+        )
     if not (os.access(target.parent, os.W_OK) and os.access(target, os.W_OK)):
         return (
             f"{path}: this process may not write it; copy the lines below into it as a user who "
@@ -70,9 +75,9 @@ def save(
 ) -> Saved:
     """Writes `values` (keys of `KEYS`) into the camera section of `path`.
 
-    `sha256` is the hash of the file that the values were made for: ChangedError when it is another one
-    now. The file before stays beside it, with the time (UTC) in its name. ConfigError when the file
-    cannot be edited without touching the rest, or the values are out of range.
+    `sha256` is the hash of the file that the values were made for: ChangedError when it is another
+    one now. The file before stays beside it, with the time (UTC) in its name. ConfigError when the
+    file cannot be edited without touching the rest, or the values are out of range.
     """
     unknown = [key for key in values if key not in KEYS]
     if unknown or not values:

@@ -1,0 +1,216 @@
+"""`bikeped align`: the ground grid over a picture, in the browser or without one."""
+
+from __future__ import annotations
+
+import itertools
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import msgspec
+
+from bikeped.cli.common import config_options, console, json_option, write_json
+from bikeped.cli.guard import guarded
+from bikeped.config import LoadedConfig, framing, ground_camera, load_config
+from bikeped.errors import BikepedError, CaptureError
+from bikeped.files import write_whole
+from bikeped.types import Frame
+
+if TYPE_CHECKING:
+    from bikeped.geometry.alignment import Alignment, Fit
+    from bikeped.web.align_points import Points
+    from bikeped.web.align_save import Saved
+
+_PICTURES = {".png", ".jpg", ".jpeg"}
+
+
+@click.command("align")
+@click.argument("picture", metavar="FRAME", type=click.Path(path_type=Path))
+@config_options
+@click.option(
+    "--at",
+    "at_s",
+    type=click.FloatRange(0, 1e6),
+    default=0.0,
+    metavar="SECONDS",
+    help="Of a video: the frame at this time; default: the first.",
+)
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port; default: a free one.")
+@click.option("--no-browser", is_flag=True, help="Only print the address.")
+@click.option(
+    "--points",
+    "points_path",
+    type=click.Path(path_type=Path),
+    help="Fit these marks (a file that the page exports) and end: no browser.",
+)
+@click.option("--save", "write", is_flag=True, help="With --points: write the fit into -c.")
+@click.option(
+    "--grid",
+    "grid_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Draw the grid over FRAME into this .png or .jpg and end: no browser.",
+)
+@json_option
+@guarded
+def command(
+    picture: Path,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    at_s: float,
+    port: int,
+    no_browser: bool,
+    points_path: Path | None,
+    write: bool,
+    grid_path: Path | None,
+    json_path: str | None,
+) -> int:
+    """Set height, pitch and lens by the ground grid over FRAME (a picture or a video).
+
+    Serves the align page until Ctrl-C. With --points or --grid it works without a browser, and
+    ends with 1 when the marks do not agree with one another.
+    """
+    from bikeped.web.align_points import fit_json, fit_points, load_points
+
+    loaded = load_config(config_path, overrides)
+    frame = _read(picture, loaded, at_s)
+    if points_path is None and (write or json_path is not None):
+        raise BikepedError("--points: missing; --save and --json are about the fit of marks")
+    if grid_path is not None and grid_path.suffix.lower() not in _PICTURES:
+        raise BikepedError(f"--grid {grid_path}: cannot be drawn; name a .png or .jpg file")
+    framing(loaded).for_frame(frame.width, frame.height)  # says what to set when it does not fit
+    if points_path is None and grid_path is None:
+        _serve(loaded, frame, picture, port, no_browser)
+        return 0
+    found, points, saved = None, None, None
+    if points_path is not None:
+        points = load_points(points_path)
+        found, _ = fit_points(ground_camera(loaded), framing(loaded), points)
+        if write:
+            saved = _save(loaded, found)
+    if grid_path is not None:
+        _draw(loaded, frame, found.alignment if found else None, points, grid_path)
+    if found is not None:
+        if json_path is not None:
+            written = {} if saved is None else {"saved": saved.keys, "backup": str(saved.backup)}
+            write_json({**fit_json(found), **written}, json_path)
+        if json_path != "-":
+            _print(found, saved)
+    if json_path != "-" and grid_path is not None:
+        click.echo(f"wrote {grid_path}")
+    return 1 if found is not None and found.strange else 0
+
+
+def _read(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
+    """One frame of a picture, a folder or a video."""
+    from bikeped.capture import open_source
+
+    if not picture.exists():
+        raise CaptureError(f"{picture}: no such file; give a picture or a video of the camera")
+    camera = loaded.config.camera
+    source = open_source(
+        str(picture.absolute()),
+        width=camera.width,
+        height=camera.height,
+        fps=camera.fps,
+        fourcc=camera.fourcc,
+    )
+    try:
+        for frame in itertools.takewhile(lambda f: f is not None, iter(source.read, None)):
+            if frame.captured_s >= at_s - 1e-6:
+                return frame
+    finally:
+        source.close()
+    raise CaptureError(f"{picture}: ends before {at_s:g} s; choose a smaller --at")
+
+
+def _serve(loaded: LoadedConfig, frame: Frame, picture: Path, port: int, no_browser: bool) -> None:
+    from bikeped.web.align import add_align
+    from bikeped.web.serve import serve_pages
+
+    def announce(url: str) -> None:
+        click.echo(f"{picture.name}: {url}align  (Ctrl-C ends)")
+        if not no_browser:
+            webbrowser.open(f"{url}align")
+
+    serve_pages(
+        msgspec.structs.replace(loaded.config.web, port=port),
+        lambda app: add_align(app, loaded, lambda: frame, live=False),
+        announce=announce,
+        base_dir=loaded.base_dir,
+        source=loaded.source,
+    )
+
+
+def _draw(
+    loaded: LoadedConfig,
+    frame: Frame,
+    alignment: Alignment | None,
+    points: Points | None,
+    target: Path,
+) -> None:
+    import cv2
+
+    from bikeped.capture.jpeg import JpegDecoder
+    from bikeped.web.align_draw import draw_grid
+    from bikeped.web.align_grid import ground_grid
+
+    camera = ground_camera(loaded)
+    if alignment is not None:
+        camera = alignment.camera(camera)
+    grid = ground_grid(camera, framing(loaded).for_frame(frame.width, frame.height))
+    rgb = frame.rgb if frame.rgb is not None else JpegDecoder().decode(frame.jpeg or b"")
+    marks: tuple[tuple[str, float, float], ...] = ()
+    if points is not None:
+        share = frame.width / points.frame.width
+        marks = tuple((mark.name, mark.u * share, mark.v * share) for mark in points.marks)
+    drawn = cv2.cvtColor(draw_grid(rgb, grid, marks), cv2.COLOR_RGB2BGR)
+    write_whole(target, cv2.imencode(target.suffix.lower(), drawn)[1].tobytes())
+
+
+def _save(loaded: LoadedConfig, found: Fit) -> Saved:
+    from bikeped.web.align_save import file_hash, save
+
+    path = Path(loaded.source)
+    values = {key: getattr(found.alignment, key) for key in found.error}
+    return save(path, values, file_hash(path))
+
+
+def _print(found: Fit, saved: Saved | None) -> None:
+    from rich.table import Table
+
+    from bikeped.geometry.alignment import PARAMETERS
+
+    screen = console()
+    numbers = Table(box=None, pad_edge=False)
+    for name in ("", "fitted", "+/-"):
+        numbers.add_column(name, justify="left" if name == "" else "right")
+    for key, error in found.error.items():
+        value: Any = getattr(found.alignment, key)
+        numbers.add_row(f"{PARAMETERS[key]} (camera.{key})", f"{value:.4f}", f"{error:.4f}")
+    screen.print(numbers)
+    marks = Table(box=None, pad_edge=False)
+    for name in ("mark", "what", "measured m", "reads m", "off cm", ""):
+        marks.add_column(name, justify="right" if " " in name else "left")
+    for r in found.residuals:
+        note = "look again" if r.strange else ""
+        marks.add_row(
+            r.mark,
+            r.what,
+            f"{r.measured_m:.2f}",
+            f"{r.read_m:.2f}",
+            f"{100 * r.off_m:+.1f}",
+            note,
+        )
+    screen.print(marks)
+    if found.at_10m_error_m is not None:
+        screen.print(f"a mark at 10 m reads 10 m +/- {100 * found.at_10m_error_m:.0f} cm")
+    if not found.spare:
+        screen.print("no measurement is left over: nothing checks these numbers; add a mark")
+    if found.suspect is not None:
+        screen.print(f"the others agree without mark {found.suspect}: measure it again")
+    elif found.strange:
+        screen.print("the marks do not agree with one another: measure them again")
+    if saved is not None:
+        keys = ", ".join(f"camera.{key}" for key in saved.keys)
+        screen.print(f"wrote {keys} into {saved.config}; before: {saved.backup.name}")

@@ -1,0 +1,147 @@
+"""The ground grid in a picture: metre lines, range rings, bearings, horizon, image circle.
+
+All of it through `GroundCamera.project`, the geometry that the service decides by: what the page
+draws is what the pole believes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.geometry import Framing, GroundCamera
+from bikeped.types import BoolArray, FloatArray
+
+RINGS_M = (5.0, 10.0, 15.0, 20.0, 25.0)
+#: Lines every metre out to here, every five out to the largest ring: farther ones only blur.
+METRE_LINES_M = 10.0
+REACH_M = RINGS_M[-1]
+_BEARINGS_DEG = tuple(range(-90, 91, 15))
+_FAR_M = 1e7  #: as good as infinitely far: the horizon
+_LABEL_BEARINGS_DEG = (0.0, -40.0, 40.0)
+
+
+@dataclass(frozen=True)
+class Label:
+    """A word at a frame pixel; `kind` is that of the line it belongs to."""
+
+    u: float
+    v: float
+    text: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Polylines by kind, each as u, v, u, v, ... in frame pixels, and labels.
+
+    Kinds: metre, five, ahead, ring, bearing, horizon, circle. `centre` is the optical centre,
+    `foot` the ground below the lens where the lens model has it.
+    """
+
+    lines: dict[str, list[list[float]]]
+    labels: list[Label]
+    centre: tuple[float, float]
+    foot: tuple[float, float] | None
+
+
+def ground_grid(camera: GroundCamera, framing: Framing) -> Grid:
+    """The grid of `camera` in frames of `framing` (see `Framing.for_frame`).
+
+    Lines run on beyond the picture's edges as far as the lens sees: who draws them cuts them.
+    """
+    open_camera = replace(camera, window_px=None)
+    kinds, points, ends = _ground_lines()
+    uv, seen = open_camera.project(points)
+    frame_uv = framing.crop_to_frame(uv)
+    lines: dict[str, list[list[float]]] = {}
+    for kind, start, end in zip(kinds, ends[:-1], ends[1:], strict=True):
+        lines.setdefault(kind, []).extend(_runs(frame_uv[start:end], seen[start:end]))
+    lines["horizon"] = _horizon(open_camera, framing)
+    turn = np.linspace(0, 2 * math.pi, 181)
+    circle = camera.lens.max_radius_px * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    rim = framing.crop_to_frame(circle + np.array([camera.cx, camera.cy]))
+    lines["circle"] = _runs(rim, np.ones(len(rim), np.bool_))
+    centre = framing.crop_to_frame((camera.cx, camera.cy)).tolist()
+    foot, foot_seen = open_camera.project([[0.0, 0.0]])
+    foot_px = framing.crop_to_frame(foot[0]).tolist() if foot_seen[0] else None
+    return Grid(lines, _labels(open_camera, framing), tuple(centre), foot_px and tuple(foot_px))
+
+
+@cache
+def _ground_lines() -> tuple[list[str], FloatArray, list[int]]:
+    """Kind of each line, all points [n, 3] on the ground, and where each line begins and ends."""
+    kinds: list[str] = []
+    parts: list[FloatArray] = []
+
+    def add(kind: str, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> None:
+        x, y = np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
+        kinds.append(kind)
+        parts.append(np.stack([x, y, np.zeros_like(x)], axis=1))
+
+    near = METRE_LINES_M
+    for metre in range(-int(near), int(near) + 1):
+        if metre % 5 == 0:
+            continue
+        add("metre", np.linspace(0, near, 81), float(metre))
+        if metre > 0:
+            add("metre", float(metre), np.linspace(-near, near, 121))
+    for five in range(-int(REACH_M), int(REACH_M) + 1, 5):
+        half = math.sqrt(REACH_M**2 - five**2)
+        if half == 0:
+            continue
+        add("ahead" if five == 0 else "five", np.linspace(0, half, 121), float(five))
+        if five >= 0:
+            add("five", float(five), np.linspace(-half, half, 201))
+    for ring in RINGS_M:
+        angle = np.radians(np.linspace(-180, 180, 241))
+        add("ring", ring * np.cos(angle), ring * np.sin(angle))
+    for bearing in _BEARINGS_DEG:
+        if bearing:
+            way = np.linspace(2.0, REACH_M, 41)
+            turn = math.radians(bearing)
+            add("bearing", way * math.cos(turn), way * math.sin(turn))
+    ends = [0, *np.cumsum([len(part) for part in parts]).tolist()]
+    return kinds, np.concatenate(parts), ends
+
+
+def _horizon(camera: GroundCamera, framing: Framing) -> list[list[float]]:
+    angle = np.radians(np.linspace(-180, 180, 241))
+    level = np.full_like(angle, camera.height_m)
+    far = np.stack([_FAR_M * np.cos(angle), _FAR_M * np.sin(angle), level], axis=1)
+    uv, seen = camera.project(far)
+    return _runs(framing.crop_to_frame(uv), seen)
+
+
+def _labels(camera: GroundCamera, framing: Framing) -> list[Label]:
+    places: list[tuple[float, float, float, str, str]] = []
+    for bearing in _LABEL_BEARINGS_DEG:
+        c, s = math.cos(math.radians(bearing)), math.sin(math.radians(bearing))
+        places += [(r * c, r * s, 0.0, f"{r:g} m", "ring") for r in RINGS_M]
+    for bearing in _BEARINGS_DEG:
+        c, s = math.cos(math.radians(bearing)), math.sin(math.radians(bearing))
+        side = "L" if bearing < 0 else "R"
+        text = f"{abs(bearing)}\u00b0 {side}" if bearing else "ahead"
+        places.append((_FAR_M * c, _FAR_M * s, camera.height_m, text, "horizon"))
+    uv, seen = camera.project([place[:3] for place in places])
+    frame_uv = framing.crop_to_frame(uv)
+    return [
+        Label(round(u, 1), round(v, 1), text, kind)
+        for (u, v), (*_, text, kind), there in zip(frame_uv.tolist(), places, seen, strict=True)
+        if there
+    ]
+
+
+def _runs(uv: FloatArray, seen: BoolArray) -> list[list[float]]:
+    """The parts of a line that are seen, each flat, to a tenth of a pixel."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
+    flat = np.round(uv, 1)
+    return [
+        flat[start:end].ravel().tolist()
+        for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        if end - start > 1
+    ]

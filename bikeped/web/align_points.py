@@ -1,0 +1,245 @@
+"""Marks as the page sends them and as `points.json` holds them, and the fit of them.
+
+One form for both: what the page exports, `bikeped align FRAME --points` takes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from bikeped.config import CameraConfig
+from bikeped.errors import BikepedError, GeometryError
+from bikeped.geometry import Framing, GroundCamera
+from bikeped.geometry.alignment import (
+    PARAMETERS,
+    Accuracy,
+    Alignment,
+    Fit,
+    Mark,
+    Spacing,
+    reading_m,
+    ten_metre_pixel,
+)
+from bikeped.geometry.alignment_fit import fit
+
+_Pixel = Annotated[float, Meta(ge=-1e5, le=1e5)]
+_Metres = Annotated[float, Meta(ge=-1000, le=1000)]
+_Side = Annotated[int, Meta(ge=2, le=100_000)]
+_Name = Annotated[str, Meta(min_length=1, max_length=20)]
+_MAX_BYTES = 1_000_000
+
+#: By how much a parameter is changed to show what that does at 10 m.
+STEPS = {
+    "height_m": 0.1,
+    "pitch_deg": 1.0,
+    "radius_px": 10.0,
+    "cx": 10.0,
+    "cy": 10.0,
+    "heading_deg": 1.0,
+}
+
+
+class FrameSize(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of the picture that the pixels lie in."""
+
+    width: _Side
+    height: _Side
+
+
+class Values(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The camera's numbers, as in the camera section; radius and centre in crop pixels."""
+
+    height_m: float
+    pitch_deg: float
+    radius_px: float
+    cx: float
+    cy: float
+    heading_deg: float = 0.0
+
+
+class Point(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A mark: frame pixel (the middle of the first pixel is 0, 0) and measured metres."""
+
+    name: _Name
+    u: _Pixel
+    v: _Pixel
+    distance_m: _Metres | None = None
+    right_m: _Metres | None = None
+    forward_m: _Metres | None = None
+
+
+class Between(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The measured distance between two marks, by name."""
+
+    first: _Name
+    second: _Name
+    distance_m: _Metres
+
+
+class Points(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All that a fit needs beside the configuration."""
+
+    frame: FrameSize
+    marks: Annotated[list[Point], Meta(max_length=40)]
+    between: Annotated[list[Between], Meta(max_length=80)] = []
+    values: Values | None = None  #: where to start, and what is not fitted; None: as configured
+    free: Annotated[list[str], Meta(max_length=6)] = ["height_m", "pitch_deg"]
+    mark_px: Annotated[float, Meta(ge=0.05, le=100)] = 1.5  #: how well a mark is set, frame pixels
+    tape_m: Annotated[float, Meta(ge=0.001, le=10)] = 0.02
+
+
+def load_points(path: Path) -> Points:
+    """A points file; BikepedError names file, key and mend."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise BikepedError(f"{path}: larger than 1 MB; is it an export of the align page?")
+        return msgspec.json.decode(path.read_bytes(), type=Points)
+    except OSError as error:
+        raise BikepedError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BikepedError(f"{path}: {error}; export the marks from the align page anew") from error
+
+
+def values_of(camera: GroundCamera) -> Values:
+    """The numbers of a camera."""
+    return Values(**asdict(Alignment.of(camera)))
+
+
+def with_values(camera: GroundCamera, values: Values | None) -> GroundCamera:
+    """`camera` with these numbers; GeometryError when one is out of the configuration's range."""
+    if values is None:
+        return camera
+    given = msgspec.structs.asdict(values)
+    try:
+        msgspec.convert(given, CameraConfig)
+    except msgspec.ValidationError as error:
+        what, _, where = str(error).partition(" - at `$.")
+        raise GeometryError(f"{where.rstrip('`')}: {what[:1].lower()}{what[1:]}") from error
+    return Alignment(**given).camera(camera)
+
+
+def fit_points(camera: GroundCamera, framing: Framing, points: Points) -> tuple[Fit, Framing]:
+    """Fits the points; `framing` is the camera's, whose frames they may be scaled copies of."""
+    frame = framing.for_frame(points.frame.width, points.frame.height)
+    names = [point.name for point in points.marks]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise GeometryError(f"marks: {twice[0]} stands twice; give each its own name")
+    marks = []
+    for point in points.marks:
+        u, v = frame.frame_to_crop((point.u, point.v)).tolist()
+        marks.append(Mark(point.name, u, v, point.distance_m, point.forward_m, point.right_m))
+    for pair in points.between:
+        for name in (pair.first, pair.second):
+            if name not in names:
+                raise GeometryError(f"between: there is no mark {name}; take the distance out")
+    spacings = [
+        Spacing(names.index(pair.first), names.index(pair.second), pair.distance_m)
+        for pair in points.between
+    ]
+    accuracy = Accuracy(points.tape_m, points.mark_px * frame.scale)
+    start = with_values(camera, points.values)
+    return fit(start, marks, spacings, tuple(points.free), accuracy), frame
+
+
+def fit_json(found: Fit) -> dict[str, Any]:
+    """A fit for a page, a file or a program: metres, degrees and crop pixels, one sigma."""
+    return {
+        "values": asdict(found.alignment),
+        "error": found.error,
+        "spare_measurements": found.spare,
+        "at_10m_error_m": found.at_10m_error_m,
+        "suspect": found.suspect,
+        "agrees": not found.strange,
+        "residuals": [
+            {
+                "mark": r.mark,
+                "what": r.what,
+                "measured_m": r.measured_m,
+                "read_m": r.read_m,
+                "off_m": r.off_m,
+                "expected_m": r.expected_m,
+                "strange": r.strange,
+            }
+            for r in found.residuals
+        ],
+    }
+
+
+def readings(camera: GroundCamera, frame: Framing, marks: list[Point]) -> list[dict[str, Any]]:
+    """What the camera reads at each mark, and the frame pixel where its measurement would lie.
+
+    With a distance alone that is along the bearing that the camera reads.
+    """
+    if not marks:
+        return []
+    xy, valid = camera.ground(frame.frame_to_crop([(p.u, p.v) for p in marks]))
+    answers = []
+    for point, (x, y), there in zip(marks, xy.tolist(), valid, strict=True):
+        if not there:
+            answers.append({"name": point.name, "on_ground": False})
+            continue
+        at = _measured(point, x, y)
+        place = None
+        if at is not None:
+            uv, seen = camera.project([at])
+            place = frame.crop_to_frame(uv[0]).round(1).tolist() if seen[0] else None
+        answers.append(
+            {
+                "name": point.name,
+                "on_ground": True,
+                "distance_m": math.hypot(x, y),
+                "forward_m": x,
+                "right_m": y,
+                "measured_at": place,
+            }
+        )
+    return answers
+
+
+def at_ten_metres(now: GroundCamera, before: GroundCamera, frame: Framing) -> dict[str, Any] | None:
+    """What a change of the numbers does to the pixel that read 10 m `before`; None: not in view.
+
+    `steps`: how far the reading moves, metres, when one number grows by its step (`STEPS`).
+    """
+    pixel = ten_metre_pixel(before)
+    here = ten_metre_pixel(now)
+    if pixel is None:
+        return None
+    steps: dict[str, float | None] = {}
+    alignment = asdict(Alignment.of(now))
+    for name in PARAMETERS:
+        steps[name] = None
+        if here is not None:
+            moved = Alignment(**{**alignment, name: alignment[name] + STEPS[name]})
+            reads = reading_m(moved.camera(now), here)
+            steps[name] = None if reads is None else reads - 10.0
+    return {
+        "pixel": np.round(frame.crop_to_frame(pixel), 1).tolist(),
+        "was_m": 10.0,
+        "reads_m": reading_m(now, pixel),
+        "by": STEPS,
+        "steps": steps,
+    }
+
+
+def _measured(point: Point, x: float, y: float) -> tuple[float, float] | None:
+    """Where the tape puts a mark that the camera reads at (x, y)."""
+    distance, right, forward = point.distance_m, point.right_m, point.forward_m
+    if forward is not None:
+        return forward, y if right is None else right
+    if distance is None or distance <= 0:
+        return None
+    if right is None:
+        share = distance / max(math.hypot(x, y), 1e-9)
+        return x * share, y * share
+    if abs(right) > distance:
+        return None
+    return math.copysign(math.sqrt(distance**2 - right**2), x), right
