@@ -11,7 +11,7 @@ from typing import Any
 import simplejpeg
 
 from bikeped.conformance.scenario import Scenario
-from bikeped.demo.avi import AviWriter
+from bikeped.scene.avi import AviWriter
 from bikeped.demo.scene import DrawnObject, Scene
 from bikeped.errors import CaptureError
 from bikeped.geometry import CameraPose, Framing, GroundCamera

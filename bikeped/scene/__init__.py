@@ -1,1 +1,30 @@
-"""Scenarios as fisheye pictures with exact labels: a known world for the chain from pixels on."""
+"""Scenarios drawn as pictures through the very camera model, with exact labels."""
+
+from __future__ import annotations
+
+from bikeped.scene.camera import (
+    DEFAULT_POSE,
+    SceneCamera,
+    lens_camera,
+    rectilinear_camera,
+    scene_camera,
+)
+from bikeped.scene.chance import random_scenario
+from bikeped.scene.conditions import LIGHTS, WEATHERS, Conditions, random_conditions
+from bikeped.scene.painter import KINDS, DrawnObject, ScenePainter
+
+__all__ = [
+    "DEFAULT_POSE",
+    "KINDS",
+    "LIGHTS",
+    "WEATHERS",
+    "Conditions",
+    "DrawnObject",
+    "SceneCamera",
+    "ScenePainter",
+    "lens_camera",
+    "random_conditions",
+    "random_scenario",
+    "rectilinear_camera",
+    "scene_camera",
+]

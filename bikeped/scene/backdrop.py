@@ -1,0 +1,235 @@
+"""What stays in a scene: sky, ground and houses, drawn once for a camera and its conditions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from bikeped.scene.camera import Rays, SceneCamera, rays
+from bikeped.scene.conditions import Conditions, Lighting, lighting
+from bikeped.scene.furniture import LAMP_HEAD_M, fixture, house
+from bikeped.scene.ground import GroundMap, ground_map, noise_tile
+from bikeped.scene.mesh import Mesh
+from bikeped.scene.place import Fixture, Place, place
+from bikeped.scene.sprite import Sprite, rasterise, shaded
+from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
+
+_SHIFT = 4
+_NEAR_M = 15.0
+_FAR_M = 52.0
+_SAMPLES = (-0.375, -0.125, 0.125, 0.375)
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A fixture, its mesh and how it looks (None: out of the picture)."""
+
+    item: Fixture
+    mesh: Mesh
+    sprite: Sprite | None
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """`image` [h, w, 3]: everything that stays but the fixtures, which stand beside it so that
+    they can hide who walks behind them. `lit` [h, w]: inside the image circle."""
+
+    view: SceneCamera
+    conditions: Conditions
+    light: Lighting
+    place: Place
+    image: ImageArray
+    lit: BoolArray
+    vignette: Float32Array
+    standing: tuple[Standing, ...]
+
+    def lamplight(self, xy_m: FloatArray) -> FloatArray | None:
+        """Light of the street lamps at a place on the ground [3]; None by day."""
+        if not self.light.lamps:
+            return None
+        return np.asarray(_lamp_pools(self.place, np.asarray(xy_m, np.float32)[None])[0] * 1.0)
+
+
+def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
+    """The backdrop; the last few are kept, for scenarios that share one."""
+    # What only moves noise about must not draw the street anew.
+    return _backdrop(view, conditions)
+
+
+@lru_cache(maxsize=2)
+def _backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
+    light, where, ray = lighting(conditions), place(conditions.place), rays(view)
+    canvas = _sky(ray, light, conditions)
+    _ground(canvas, ray, view, where, light)
+    image = np.clip(canvas, 0, 255).astype(np.uint8)
+    for item in sorted(where.houses, key=lambda h: -abs(h.front) - abs((h.x0 + h.x1) / 2 - 5)):
+        _draw_far(image, house(item, light.lamps), view, light)
+    image = np.asarray(
+        cv2.multiply(image, cv2.merge([ray.vignette] * 3), dtype=cv2.CV_8U), np.uint8
+    )
+    image[~ray.lit] = 0
+    standing = []
+    for item in where.fixtures:
+        mesh = fixture(item)
+        away = float(np.hypot(*(np.array(item.xy_m) - view.eye_m[:2])))
+        local = (
+            _lamp_pools(where, np.array([item.xy_m], np.float32))[0].astype(np.float64)
+            if light.lamps
+            else None
+        )
+        standing.append(
+            Standing(item, mesh, rasterise(mesh, view, light, local=local, away_m=away))
+        )
+    return Backdrop(view, conditions, light, where, image, ray.lit, ray.vignette, tuple(standing))
+
+
+def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
+    """Sky colours [h, w, 3]: paler and hazier toward the horizon, with a flat layer of clouds."""
+    up = np.clip(ray.world[..., 2], 0, 1)
+    part = ((1 - up) ** 3)[..., None]
+    out = light.sky_top.astype(np.float32) * (1 - part) + light.sky_low.astype(np.float32) * part
+    spread = 1 / (up + 0.12)
+    tile = noise_tile(conditions.place % 3)
+    shift = float(conditions.seed % 97)
+    cloud = np.asarray(
+        cv2.remap(
+            tile,
+            (ray.world[..., 0] * spread * 60 + shift) % 512,
+            (ray.world[..., 1] * spread * 60) % 512,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_WRAP,
+        )
+    )
+    cover = np.clip(cloud * 0.35 + light.clouds - 0.45, 0, 0.8) * np.clip(up * 6, 0, 1)
+    white = np.clip(
+        light.sky_low * 0.35 + 165 * light.ground / max(light.ground.max(), 0.9), 0, 250
+    )
+    out += cover[..., None] * (white.astype(np.float32) - out)
+    if light.sun.any():
+        toward = np.clip(ray.world @ light.to_sun.astype(np.float32), 0, 1)
+        glow = toward**60 * 0.5 + toward**900
+        out += (glow * (140 + 160 * light.glare))[..., None] * np.array(
+            [1.0, 0.95, 0.8], np.float32
+        )
+    return np.asarray(out, np.float32)
+
+
+def _ground(
+    canvas: Float32Array, ray: Rays, view: SceneCamera, where: Place, light: Lighting
+) -> None:
+    """Paints the ground into `canvas` below the horizon."""
+    down = -ray.world[..., 2]
+    rows = np.flatnonzero((down > 1e-3).any(axis=1))
+    if len(rows) == 0:
+        return
+    top, bottom = int(rows[0]), int(rows[-1]) + 1
+    w = ray.world[top:bottom]
+    down = np.maximum(down[top:bottom], 1e-3)
+    eye = view.eye_m.astype(np.float32)
+    reach = eye[2] / down  # slant distance
+    x, y = eye[0] + w[..., 0] * reach, eye[1] + w[..., 1] * reach
+    away = np.hypot(x - eye[0], y - eye[1])
+    inverse = 1 / np.maximum(away, 1e-3)
+    # One pixel's depth on the ground, along the line of sight.
+    deep = reach * reach / (eye[2] * view.focal_px)
+    along = (x - eye[0]) * inverse * deep, (y - eye[1]) * inverse * deep
+    fine = float(np.clip(2.2 / view.focal_px * 4.0, 0.012, 0.05))
+    near = ground_map(where, eye[0] - 16, eye[1] - 3, eye[0] + 16, eye[1] + 17, fine)
+    far = ground_map(where, eye[0] - 56, eye[1] - 28, eye[0] + 56, eye[1] + 50, 0.08)
+    out = np.empty((*x.shape, 3), np.float32)
+    blurred = GroundMap(np.asarray(cv2.blur(far.image, (9, 9)), np.uint8), far.x0, far.y0, far.res)
+    at_far = _looked_up(far, x, y, along, _SAMPLES)
+    at_horizon = _looked_up(blurred, x, y, along, (0.0,))
+    t = np.clip((away - 26) / 14, 0, 1)[..., None]
+    out = at_far * (1 - t) + at_horizon * t
+    at_near = _looked_up(near, x, y, along, (-0.25, 0.25))
+    t = np.clip((_NEAR_M - away) / 3, 0, 1)[..., None]
+    out += t * (at_near - out)
+    lit: FloatArray | Float32Array = light.ground.astype(np.float32)
+    if light.lamps:
+        lit = lit + _lamp_pools(where, np.dstack([x, y]))
+    if light.wet:
+        out *= 0.62
+    out *= lit
+    if light.wet:  # a wet road mirrors the sky, the flatter the more
+        shine = 0.10 + 0.75 * (1 - down) ** 5
+        tile = noise_tile(1)
+        patch = np.asarray(
+            cv2.remap(
+                tile, (x * 24) % 512, (y * 24) % 512, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+            )
+        )
+        shine = np.clip(shine * (0.75 + 0.3 * patch), 0, 0.9)[..., None]
+        out += shine * (light.sky_low.astype(np.float32) * 0.9 - out)
+    haze = (1 - np.exp(-np.maximum(away - 15, 0) / light.haze_m))[..., None]
+    out += haze * (light.sky_low.astype(np.float32) - out)
+    below = (-ray.world[top:bottom, :, 2] > 1e-3)[..., None]
+    np.copyto(canvas[top:bottom], out, where=below)
+
+
+def _looked_up(
+    source: GroundMap,
+    x: Float32Array,
+    y: Float32Array,
+    along: tuple[Float32Array, Float32Array],
+    offsets: tuple[float, ...],
+) -> Float32Array:
+    """The map's colours at ground positions, averaged over points `offsets` of the pixel's depth;
+    beyond its edges the edge goes on."""
+    total: Float32Array | None = None
+    for offset in offsets:
+        u = (x + along[0] * offset - source.x0) / source.res - 0.5
+        v = (y + along[1] * offset - source.y0) / source.res - 0.5
+        part = np.asarray(
+            cv2.remap(source.image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+            np.float32,
+        )
+        total = part if total is None else total + part
+    assert total is not None
+    return total / len(offsets)
+
+
+def _lamp_pools(where: Place, xy: Float32Array) -> Float32Array:
+    """Light of the street lamps at ground positions [..., 2] as factors [..., 3]."""
+    out = np.zeros((*xy.shape[:-1], 3), np.float32)
+    colour = np.array([0.72, 0.58, 0.38], np.float32)
+    reach, high = LAMP_HEAD_M
+    for item in where.fixtures:
+        if item.what != "lamp":
+            continue
+        lx = item.xy_m[0] + reach * np.cos(item.heading_rad)
+        ly = item.xy_m[1] + reach * np.sin(item.heading_rad)
+        sq = (xy[..., 0] - lx) ** 2 + (xy[..., 1] - ly) ** 2
+        out += ((high**2 / (sq + high**2)) ** 1.8)[..., None] * colour
+    # The lamp above the camera's own pole.
+    sq = (xy[..., 0] - 5) ** 2 + (xy[..., 1] + 9) ** 2
+    out += ((30 / (sq + 30)) ** 1.5)[..., None] * colour * 0.8
+    return out
+
+
+def _draw_far(image: ImageArray, mesh: Mesh, view: SceneCamera, light: Lighting) -> None:
+    """Draws a solid of the background straight into the picture, its edges smoothed."""
+    quads = mesh.quads
+    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    middle = quads.mean(axis=1)
+    facing = np.flatnonzero(((view.eye_m - middle) * normal).sum(1) > 0)
+    if len(facing) == 0:
+        return
+    pixels = view.pixels(quads[facing].reshape(-1, 3)).reshape(-1, 4, 2)
+    width, height = view.size
+    with np.errstate(invalid="ignore"):
+        seen = np.isfinite(pixels).all(axis=(1, 2))
+        seen &= (pixels.max(axis=1) > 0).all(axis=1) & (pixels.min(axis=1) < (width, height)).all(
+            axis=1
+        )
+    kept = facing[seen]
+    away = np.linalg.norm(middle[kept] - view.eye_m, axis=1)
+    haze = (1 - np.exp(-np.maximum(away - 15, 0) / light.haze_m))[:, None]
+    colour = shaded(mesh, normal, kept, light, np.array([0.12, 0.1, 0.07]) if light.lamps else None)
+    colour += haze * (light.sky_low - colour)
+    fixed = np.round((pixels[seen] - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)).astype(np.int32)
+    for i in np.argsort(mesh.layer[kept], kind="stable"):
+        cv2.fillConvexPoly(image, fixed[i], colour[i].tolist(), cv2.LINE_AA, _SHIFT)

@@ -1,0 +1,92 @@
+"""Scenarios drawn at random, for training: who could stand or pass before the camera."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bikeped.conformance.scenario import SIZES_M, Agent, Scenario
+from bikeped.scene.camera import DEFAULT_POSE
+
+_DURATION_S = 6.0
+_NEAREST_M, _FARTHEST_M = 1.5, 40.0
+
+
+def random_scenario(seed: int) -> Scenario:
+    """A scenario of 6 s: walkers, children, wheelchairs, cyclists, e-scooters and vehicles, none to
+    a crowd, 1.5 to 40 m before the usual camera, in all directions, some standing still."""
+    rng = np.random.default_rng((seed, 41))
+    busy = float(rng.choice([0.25, 1.0, 2.0]))
+    agents: list[Agent] = []
+    taken: list[tuple[float, float, float]] = []
+
+    def add(kind: str, size: tuple[float, float, float], speed: float, spread: float = 0.0) -> None:
+        for _ in range(12):
+            x, y = _spot(rng, kind)
+            if spread and taken:  # beside somebody already there
+                tx, ty, _ = taken[int(rng.integers(len(taken)))]
+                x, y = tx + float(rng.normal(0, spread)), ty + float(rng.normal(0, spread))
+            room = max(size[0], size[1]) / 2 + 0.25
+            if all(math.hypot(x - a, y - b) > room + r for a, b, r in taken):
+                break
+        else:
+            return
+        taken.append((x, y, room - 0.25))
+        heading = _heading(rng, kind)
+        # The middle of the clip finds the agent at its spot; still ones turn their own way.
+        step = speed * _DURATION_S / 2
+        if speed < 0.05:
+            step = 0.01
+        dx, dy = math.cos(heading) * step, math.sin(heading) * step
+        path = np.array([[0.0, x - dx, y - dy], [_DURATION_S, x + dx, y + dy]])
+        agents.append(Agent(len(agents) + 1, kind, path, size))
+
+    def varied(kind: str, part: float = 0.08) -> tuple[float, float, float]:
+        length, width, height = SIZES_M[kind]
+        s = 1 + float(np.clip(rng.normal(0, part / 2), -part, part))
+        return length * s, width * s, height * s
+
+    for _ in range(int(rng.poisson(2.2 * busy))):
+        draw = rng.random()
+        size = varied("pedestrian")
+        if draw < 0.15:
+            tall = float(rng.uniform(0.95, 1.35))
+            size = (0.26, 0.36, tall)
+        elif draw < 0.25:
+            size = (1.1, 0.65, 1.3)
+        speed = 0.0 if rng.random() < 0.3 else float(rng.uniform(0.6, 1.8))
+        add("pedestrian", size, speed, 0.8 if rng.random() < 0.25 else 0.0)
+    for _ in range(int(rng.poisson(1.8 * busy))):
+        size = varied("cyclist", 0.05) if rng.random() < 0.75 else (1.2, 0.5, 1.75)
+        speed = 0.0 if rng.random() < 0.12 else float(rng.uniform(2.0, 9.0))
+        add("cyclist", size, speed, 1.2 if rng.random() < 0.15 else 0.0)
+    for _ in range(int(rng.poisson(0.9 * busy))):
+        kind = str(rng.choice(["car", "bus", "truck", "motorcycle"], p=[0.7, 0.1, 0.12, 0.08]))
+        add(kind, varied(kind, 0.06), 0.0 if rng.random() < 0.25 else float(rng.uniform(2, 12)))
+    if not agents:
+        add("pedestrian", varied("pedestrian"), 1.2)
+    return Scenario(f"random {seed}", "standard", "idle", "bicycle", tuple(agents))
+
+
+def _spot(rng: np.random.Generator, kind: str) -> tuple[float, float]:
+    """A ground position before the usual camera; near ones as often as far ones."""
+    nearest = _NEAREST_M if kind == "pedestrian" else 2.5
+    if kind in {"car", "bus", "truck"}:
+        nearest = 6.0
+    for _ in range(50):
+        away = float(math.exp(rng.uniform(math.log(nearest), math.log(_FARTHEST_M))))
+        bearing = float(rng.uniform(-1.45, 1.45))
+        x = DEFAULT_POSE.x_m + away * math.sin(bearing)
+        y = DEFAULT_POSE.y_m + away * math.cos(bearing)
+        if kind in {"car", "bus", "truck"} and abs(y) > 4.6:
+            continue
+        if y < 9.0:
+            return x, y
+    return DEFAULT_POSE.x_m + 3.0, -4.0
+
+
+def _heading(rng: np.random.Generator, kind: str) -> float:
+    if kind in {"car", "bus", "truck"} and rng.random() < 0.8:
+        return float(rng.choice([0.0, math.pi])) + float(rng.normal(0, 0.05))
+    return float(rng.uniform(-math.pi, math.pi))

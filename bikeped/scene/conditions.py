@@ -1,0 +1,149 @@
+"""Light and weather of a drawn scene: from a few words to suns, skies and noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bikeped.errors import ScenarioError
+from bikeped.types import FloatArray
+
+LIGHTS = ("day", "overcast", "dusk", "night", "glare")
+WEATHERS = ("dry", "rain")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a scene looks like beside who is in it.
+
+    `seed`: clothes, paints, noise. `light`: day, overcast, dusk, night, glare. `weather`: dry,
+    rain. `place`: road layout, houses, textures and occluders (poles, trees, parked cars); 0 is
+    the plain street of the bundled scenarios. `noise`: standard deviation of the sensor's noise in
+    grey levels by day; darkness raises it.
+    """
+
+    seed: int = 0
+    light: str = "day"
+    weather: str = "dry"
+    place: int = 0
+    noise: float = 2.5
+
+    def __post_init__(self) -> None:
+        if self.light not in LIGHTS:
+            raise ScenarioError(f"light: {self.light!r} is not one of {', '.join(LIGHTS)}")
+        if self.weather not in WEATHERS:
+            raise ScenarioError(f"weather: {self.weather!r} is not one of {', '.join(WEATHERS)}")
+        if not 0 <= self.noise <= 40:
+            raise ScenarioError(f"noise: {self.noise} is not 0 to 40 grey levels")
+        if self.seed < 0 or self.place < 0:
+            raise ScenarioError("seed, place: must not be negative")
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Conditions made into numbers. Colours are factors [3] on reflected colours in 0..255.
+
+    `to_sun` [3]: unit vector in the world; `sun` zero where none shines. `sky_top`, `sky_low` and
+    `haze` are colours in 0..255. `noise`: standard deviation in grey levels.
+    """
+
+    to_sun: FloatArray
+    sun: FloatArray
+    ambient: FloatArray
+    sky_top: FloatArray
+    sky_low: FloatArray
+    clouds: float
+    haze_m: float  #: distance at which haze takes over
+    lamps: bool
+    wet: bool
+    glare: float
+    noise: float
+
+    @property
+    def shade(self) -> FloatArray:
+        """What a shadow leaves of the light on level ground [3]."""
+        level = self.sun * max(float(self.to_sun[2]), 0.0)
+        return np.asarray(self.ambient / np.maximum(self.ambient + level, 1e-6))
+
+    @property
+    def ground(self) -> FloatArray:
+        """Light on level ground [3]."""
+        return np.asarray(self.ambient + self.sun * max(float(self.to_sun[2]), 0.0))
+
+
+def lighting(conditions: Conditions) -> Lighting:
+    """The light of these conditions; sun and strength vary with `seed` and `place`."""
+    rng = np.random.default_rng((conditions.seed, conditions.place, 11))
+    kind, wet = conditions.light, conditions.weather == "rain"
+    azimuth = math.radians(float(rng.uniform(0, 360)))
+    height = math.radians(float(rng.uniform(28, 62)))
+    gain = float(rng.uniform(0.88, 1.1))
+    warm = float(rng.uniform(-0.03, 0.03))
+    sun, ambient = np.array([0.66, 0.61, 0.53]), np.array([0.46, 0.49, 0.54])
+    top, low = np.array([92.0, 146, 208]), np.array([206.0, 217, 226])
+    clouds, haze, noise, glare = float(rng.uniform(0.1, 0.8)), 240.0, conditions.noise, 0.0
+    if kind == "overcast":
+        sun, ambient = np.zeros(3), np.array([0.76, 0.77, 0.8])
+        top, low, clouds, haze = (
+            np.array([168.0, 174, 182]),
+            np.array([204.0, 207, 210]),
+            0.5,
+            170.0,
+        )
+    elif kind == "dusk":
+        height = math.radians(float(rng.uniform(7, 16)))
+        sun, ambient = np.array([0.62, 0.40, 0.22]), np.array([0.27, 0.29, 0.38])
+        top, low = np.array([72.0, 92, 142]), np.array([222.0, 166, 122])
+        noise *= 1.5
+    elif kind == "night":
+        sun, ambient = np.zeros(3), np.array([0.10, 0.11, 0.15])
+        top, low, clouds, haze = np.array([10.0, 12, 22]), np.array([38.0, 34, 38]), 0.15, 300.0
+        noise *= 2.4
+    elif kind == "glare":
+        # In the picture: within 50 degrees of north, where the usual camera looks, and low.
+        azimuth = math.radians(90 + float(rng.uniform(-50, 50)))
+        height = math.radians(float(rng.uniform(9, 24)))
+        sun, ambient = np.array([0.85, 0.78, 0.64]), np.array([0.36, 0.37, 0.40])
+        top, low = np.array([142.0, 172, 208]), np.array([246.0, 236, 212])
+        glare = float(rng.uniform(0.6, 1.0))
+    if wet:
+        sun = sun * 0.12
+        ambient = ambient * (np.array([0.86, 0.88, 0.9]) if kind != "night" else 1.0)
+        grey = np.array([0.30, 0.59, 0.11])
+        top = 0.35 * top + 0.65 * float(top @ grey)
+        low = 0.4 * low + 0.6 * float(low @ grey)
+        clouds, haze, glare, noise = 0.6, haze * 0.45, glare * 0.35, noise * 1.2
+    tint = gain * np.array([1 + warm, 1.0, 1 - warm])
+    return Lighting(
+        to_sun=np.array(
+            [
+                math.cos(azimuth) * math.cos(height),
+                math.sin(azimuth) * math.cos(height),
+                math.sin(height),
+            ]
+        ),
+        sun=sun * tint,
+        ambient=ambient * tint,
+        sky_top=top * gain,
+        sky_low=low * gain,
+        clouds=clouds,
+        haze_m=haze,
+        lamps=kind in {"night", "dusk"},
+        wet=wet,
+        glare=glare,
+        noise=noise,
+    )
+
+
+def random_conditions(seed: int) -> Conditions:
+    """Conditions for training: every light, weather and place, noise from clean to grainy."""
+    rng = np.random.default_rng((seed, 23))
+    return Conditions(
+        seed=int(rng.integers(1 << 30)),
+        light=str(rng.choice(LIGHTS, p=[0.4, 0.22, 0.13, 0.13, 0.12])),
+        weather="rain" if rng.random() < 0.18 else "dry",
+        place=int(rng.integers(1 << 30)),
+        noise=float(round(rng.uniform(0.5, 5.0), 2)),
+    )

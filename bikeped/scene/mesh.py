@@ -1,0 +1,280 @@
+"""Solids as coloured four-cornered faces: limbs, lofts, boxes and wheels. Pure.
+
+Body axes are x forward, y left, z up, in metres. Faces run counter-clockwise seen from outside, so
+that what turns away from the camera can be left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.types import FloatArray
+
+Rgb = tuple[float, float, float]
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """Something that shines: place [3] in metres, its colour, its strength (a headlight is 1)."""
+
+    at: FloatArray
+    colour: Rgb
+    strength: float
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """`quads` [n, 4, 3] metres; `colours` [n, 3] reflected share in 0..255; `glow` [n] 0..1, the
+    share that shines by itself; `layer` [n], higher is drawn later (a window on its wall)."""
+
+    quads: FloatArray
+    colours: FloatArray
+    glow: FloatArray
+    layer: npt.NDArray[np.int8]
+    lamps: tuple[Lamp, ...] = ()
+
+    def placed(
+        self, xy_m: npt.ArrayLike, heading_rad: float, stretch: Sequence[float] = (1, 1, 1)
+    ) -> Mesh:
+        """The mesh stretched, turned to `heading_rad` and set at `xy_m` [2] of the world."""
+        c, s = math.cos(heading_rad), math.sin(heading_rad)
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.diag(np.asarray(stretch, float))
+        shift = np.array([*np.asarray(xy_m, float), 0.0])
+        lamps = tuple(
+            Lamp(turn @ lamp.at + shift, lamp.colour, lamp.strength) for lamp in self.lamps
+        )
+        return Mesh(self.quads @ turn.T + shift, self.colours, self.glow, self.layer, lamps)
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """All of them as one."""
+    return Mesh(
+        np.concatenate([m.quads for m in meshes]),
+        np.concatenate([m.colours for m in meshes]),
+        np.concatenate([m.glow for m in meshes]),
+        np.concatenate([m.layer for m in meshes]),
+        tuple(lamp for m in meshes for lamp in m.lamps),
+    )
+
+
+@dataclass
+class Builder:
+    """Collects faces; `sides` is how many a round limb has."""
+
+    sides: int = 8
+    _quads: list[FloatArray] = field(default_factory=list)
+    _colours: list[FloatArray] = field(default_factory=list)
+    _glow: list[FloatArray] = field(default_factory=list)
+    _layer: list[npt.NDArray[np.int8]] = field(default_factory=list)
+    _limbs: list[tuple[Point, Point, float, float, Rgb, int]] = field(default_factory=list)
+    _lamps: list[Lamp] = field(default_factory=list)
+
+    def faces(
+        self, quads: npt.ArrayLike, colour: npt.ArrayLike, glow: float = 0.0, layer: int = 0
+    ) -> None:
+        """Faces [n, 4, 3] in one colour [3] or one a face [n, 3]."""
+        array = np.asarray(quads, np.float64).reshape(-1, 4, 3)
+        self._quads.append(array)
+        self._colours.append(np.broadcast_to(np.asarray(colour, np.float64), (len(array), 3)))
+        self._glow.append(np.full(len(array), glow))
+        self._layer.append(np.full(len(array), layer, np.int8))
+
+    def limb(
+        self, a: Point, b: Point, radius_a: float, radius_b: float, colour: Rgb, layer: int = 0
+    ) -> None:
+        """A round tapering limb with round ends of these radii about `a` and `b`."""
+        self._limbs.append((a, b, radius_a, radius_b, colour, layer))
+
+    def loft(
+        self,
+        centres: npt.ArrayLike,
+        radii: npt.ArrayLike,
+        colour: npt.ArrayLike,
+        *,
+        across: Point = (0.0, 1.0, 0.0),
+        layer: int = 0,
+        sides: int = 10,
+    ) -> None:
+        """A skin over ellipses about `centres` [r, 3], each `radii` [r, 2] wide (`across`, and the
+        other way) and across the way to the next; `colour` [3] or one a band [r - 1, 3]."""
+        c, r = np.asarray(centres, np.float64), np.asarray(radii, np.float64)
+        way = c[-1] - c[0]
+        u = np.asarray(across, np.float64)
+        v = np.cross(way / max(float(np.linalg.norm(way)), 1e-9), u)
+        turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+        ring = (
+            c[:, None]
+            + r[:, :1, None] * np.cos(turn)[:, None] * u
+            + r[:, 1:, None] * np.sin(turn)[:, None] * v
+        )
+        quads = _bands(ring)
+        bands = np.broadcast_to(np.asarray(colour, np.float64), (len(c) - 1, 3))
+        self.faces(quads, np.repeat(bands, sides, axis=0), layer=layer)
+
+    def ball(self, at: Point, radii: Point, colour: npt.ArrayLike, layer: int = 0) -> None:
+        """An ellipsoid of half axes `radii` (forward, left, up); `colour` may be one a band, 6."""
+        up = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 7))
+        wide = np.sqrt(1 - up**2)
+        centres = np.array(at) + np.stack([np.zeros(7), np.zeros(7), up * radii[2]], axis=1)
+        # Across is left; the other way, up x left, is backward: the sign does not matter to it.
+        self.loft(
+            centres, np.stack([wide * radii[1], wide * radii[0]], axis=1), colour, layer=layer
+        )
+
+    def box(
+        self,
+        low: Point,
+        high: Point,
+        colour: Rgb,
+        *,
+        layer: int = 0,
+        pieces: int = 1,
+        glow: float = 0.0,
+    ) -> None:
+        """A box between two corners, its sides cut `pieces` times along x."""
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        xs = np.linspace(x0, x1, pieces + 1)
+        quads = []
+        for a, b in zip(xs, xs[1:], strict=False):
+            quads += [
+                [(a, y0, z0), (b, y0, z0), (b, y0, z1), (a, y0, z1)],
+                [(b, y1, z0), (a, y1, z0), (a, y1, z1), (b, y1, z1)],
+                [(a, y0, z1), (b, y0, z1), (b, y1, z1), (a, y1, z1)],
+                [(a, y1, z0), (b, y1, z0), (b, y0, z0), (a, y0, z0)],
+            ]
+        quads += [
+            [(x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1)],
+            [(x0, y1, z0), (x0, y0, z0), (x0, y0, z1), (x0, y1, z1)],
+        ]
+        self.faces(quads, colour, glow, layer)
+
+    def wheel(
+        self,
+        hub: Point,
+        radius: float,
+        tube: float,
+        colour: Rgb,
+        *,
+        spokes: int = 0,
+        turned: float = 0.0,
+        spoke_colour: Rgb = (150, 152, 156),
+        steps: int = 22,
+    ) -> None:
+        """A tyre standing along x about `hub`, with spokes; radius to the outside, tube half."""
+        turn = np.linspace(0, 2 * np.pi, steps, endpoint=False)
+        rings = []
+        # Out, left, in, right about the tube; outside is where the ring order runs to the left.
+        for along, left in ((1.0, 0.0), (0.0, -1.0), (-1.0, 0.0), (0.0, 1.0)):
+            r = radius - tube + along * tube
+            rings.append(
+                np.stack(
+                    [
+                        hub[0] + r * np.cos(turn),
+                        np.full(steps, hub[1] + left * tube),
+                        hub[2] + r * np.sin(turn),
+                    ],
+                    axis=1,
+                )
+            )
+        closed = np.stack([*rings, rings[0]])
+        self.faces(_bands(closed)[:, ::-1], colour)
+        for i in range(spokes):
+            a = turned + i * math.pi / spokes
+            f, u = (radius - tube) * math.cos(a), (radius - tube) * math.sin(a)
+            wide, high = -0.006 * math.sin(a), 0.006 * math.cos(a)
+            one, other = (hub[0] - f, hub[2] - u), (hub[0] + f, hub[2] + u)
+            ribbon = np.array(
+                [
+                    (one[0] - wide, hub[1], one[1] - high),
+                    (other[0] - wide, hub[1], other[1] - high),
+                    (other[0] + wide, hub[1], other[1] + high),
+                    (one[0] + wide, hub[1], one[1] + high),
+                ]
+            )
+            self.faces(np.stack([ribbon, ribbon[::-1]]), spoke_colour)
+
+    def disc(
+        self, hub: Point, radius: float, left: float, colour: Rgb, layer: int = 1, steps: int = 16
+    ) -> None:
+        """A round plate facing left (`left` 1) or right (-1)."""
+        turn = np.linspace(0, 2 * np.pi, steps + 1)
+        rim = np.stack(
+            [
+                hub[0] + radius * np.cos(turn),
+                np.full(steps + 1, hub[1]),
+                hub[2] + radius * np.sin(turn),
+            ],
+            axis=1,
+        )
+        middle = np.broadcast_to(np.array(hub), rim[:-1].shape)
+        quads = np.stack([middle, rim[1:], rim[:-1], middle], axis=1)
+        self.faces(quads if left > 0 else quads[:, ::-1], colour, layer=layer)
+
+    def lamp(self, at: Point, colour: Rgb, strength: float) -> None:
+        """A light of this strength at a point."""
+        self._lamps.append(Lamp(np.array(at), colour, strength))
+
+    def build(self) -> Mesh:
+        """All that was collected."""
+        if self._limbs:
+            self._build_limbs()
+        return Mesh(
+            np.concatenate(self._quads),
+            np.concatenate(self._colours),
+            np.concatenate(self._glow),
+            np.concatenate(self._layer),
+            tuple(self._lamps),
+        )
+
+    def _build_limbs(self) -> None:
+        """All limbs at once: six rings each, the outer ones shrunk to the rounded ends."""
+        a = np.array([limb[0] for limb in self._limbs], np.float64)
+        b = np.array([limb[1] for limb in self._limbs], np.float64)
+        ra = np.array([limb[2] for limb in self._limbs])
+        rb = np.array([limb[3] for limb in self._limbs])
+        colour = np.array([limb[4] for limb in self._limbs], np.float64)
+        layer = np.array([limb[5] for limb in self._limbs], np.int8)
+        self._limbs = []
+        way = b - a
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        d = np.where(length > 1e-9, way / np.maximum(length, 1e-9), (0.0, 0.0, 1.0))
+        helper = np.where(np.abs(d[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+        u = np.cross(helper, d)
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        v = np.cross(d, u)
+        zero = np.zeros_like(ra)
+        radius = np.stack([zero, 0.75 * ra, ra, rb, 0.75 * rb, zero], axis=1)
+        along = np.stack(
+            [-ra, -0.66 * ra, zero, length[:, 0], length[:, 0] + 0.66 * rb, length[:, 0] + rb],
+            axis=1,
+        )
+        centre = a[:, None] + along[..., None] * d[:, None]
+        turn = np.linspace(0, 2 * np.pi, self.sides, endpoint=False)
+        spread = (
+            np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * v[:, None]
+        )  # [m, sides, 3]
+        ring = centre[:, :, None] + radius[:, :, None, None] * spread[:, None]
+        following = np.roll(ring, -1, axis=2)
+        quads = np.stack(
+            [ring[:, :-1], following[:, :-1], following[:, 1:], ring[:, 1:]], axis=3
+        ).reshape(-1, 4, 3)
+        per = len(quads) // len(a)
+        self._quads.append(quads)
+        self._colours.append(np.repeat(colour, per, axis=0))
+        self._glow.append(np.zeros(len(quads)))
+        self._layer.append(np.repeat(layer, per))
+
+
+def _bands(rings: FloatArray) -> FloatArray:
+    """Faces [(r - 1) * s, 4, 3] between neighbouring rings [r, s, 3]."""
+    following = np.roll(rings, -1, axis=1)
+    quads: FloatArray = np.stack(
+        [rings[:-1], following[:-1], following[1:], rings[1:]], axis=2
+    ).reshape(-1, 4, 3)
+    return quads

@@ -1,0 +1,187 @@
+"""Where the street lies and what stands along it: a place by its number. Pure.
+
+The road runs along the world's x axis with a crosswalk at x = 5 and a side street to the west, as
+the bundled scenarios have it; widths, markings, colours, houses and furniture vary by place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bikeped.scene.mesh import Rgb
+
+CROSSING_X_M = 5.0
+
+
+@dataclass(frozen=True)
+class Fixture:
+    """One thing that stands: `what` (lamp, sign, tree, bin, hydrant, signal, bollard, car), where
+    [x, y], which way it faces, and a number for its looks."""
+
+    what: str
+    xy_m: tuple[float, float]
+    heading_rad: float
+    number: int
+
+
+@dataclass(frozen=True)
+class House:
+    """A block between two corners, `front` toward smaller y, with `floors` of windows."""
+
+    x0: float
+    x1: float
+    front: float
+    depth: float
+    height: float
+    wall: Rgb
+    number: int
+
+
+@dataclass(frozen=True)
+class Place:
+    """Everything that stays. Metres in the world frame."""
+
+    number: int
+    kerb: float  #: the road reaches from -kerb to kerb
+    walk: float  #: width of the sidewalks
+    side_street: tuple[float, float] | None  #: x from, to
+    crosswalk: tuple[float, float]
+    crosswalk_style: str
+    bike_lanes: bool
+    green_lanes: bool
+    lane_m: float  #: where the bicycle lane's inner line lies
+    asphalt: Rgb
+    paving: Rgb
+    verge: Rgb
+    slab_m: float
+    yellow_centre: bool
+    houses: tuple[House, ...]
+    fixtures: tuple[Fixture, ...]
+
+
+_WALLS: tuple[Rgb, ...] = (
+    (168, 104, 84), (206, 192, 168), (150, 158, 166), (188, 150, 110), (128, 104, 96),
+    (222, 214, 204), (142, 88, 72), (176, 180, 160), (196, 170, 140), (110, 116, 124),
+)  # fmt: skip
+
+
+def place(number: int) -> Place:
+    """The place of this number; the same number is always the same place."""
+    rng = np.random.default_rng((number, 5))
+    usual = number == 0
+    kerb = 6.1 if usual else float(rng.uniform(4.9, 8.0))
+    walk = 4.0 if usual else float(rng.uniform(2.6, 5.0))
+    side = (-7.6, -1.2) if usual or rng.random() < 0.6 else None
+    if side is not None and not usual:
+        middle, half = float(rng.uniform(-16, -4)), float(rng.uniform(2.8, 4.2))
+        side = (middle - half, middle + half)
+    half_walk = 1.7 if usual else float(rng.uniform(1.3, 2.2))
+    grey = float(rng.uniform(-16, 14)) if not usual else 0.0
+    asphalt = (98 + grey, 100 + grey, 104 + grey)
+    paving = (
+        (168.0, 164.0, 156.0),
+        (150.0, 148.0, 146.0),
+        (176.0, 150.0, 130.0),
+        (188.0, 184.0, 176.0),
+    )[0 if usual else int(rng.integers(4))]
+    verge = (
+        (104.0, 128.0, 74.0),
+        (128.0, 126.0, 92.0),
+        (158.0, 154.0, 148.0),
+        (86.0, 110.0, 64.0),
+    )[0 if usual else int(rng.integers(4))]
+    return Place(
+        number=number,
+        kerb=kerb,
+        walk=walk,
+        side_street=side,
+        crosswalk=(CROSSING_X_M - half_walk, CROSSING_X_M + half_walk),
+        crosswalk_style="bars" if usual else str(rng.choice(["bars", "ladder", "lines", "worn"])),
+        bike_lanes=usual or bool(rng.random() < 0.7),
+        green_lanes=usual or bool(rng.random() < 0.4),
+        lane_m=2.2 if usual else float(rng.uniform(0.36, 0.42)) * kerb,
+        asphalt=asphalt,
+        paving=paving,
+        verge=verge,
+        slab_m=0.9 if usual else float(rng.choice([0.5, 0.75, 1.2, 1.5])),
+        yellow_centre=usual or bool(rng.random() < 0.5),
+        houses=_houses(rng, kerb + walk, side),
+        fixtures=_fixtures(rng, usual, kerb, walk, side),
+    )
+
+
+def _houses(
+    rng: np.random.Generator, edge: float, side: tuple[float, float] | None
+) -> tuple[House, ...]:
+    """A row north of the street, and one south behind the camera far to both sides."""
+    houses = []
+    setback = float(rng.uniform(0.5, 6.0))
+    low = float(rng.uniform(4.5, 8.0))
+    for row, start, end in (("north", -95.0, 105.0), ("south", -95.0, 105.0)):
+        x = start
+        while x < end:
+            wide = float(rng.uniform(7, 16))
+            tall = low + float(rng.uniform(0, 10))
+            gap = 0.0 if rng.random() < 0.7 else float(rng.uniform(2, 6))
+            wall = _WALLS[int(rng.integers(len(_WALLS)))]
+            if side is not None and x < side[1] + 2.5 and x + wide > side[0] - 2.5:
+                if x < side[0] - 2.5 - 4:
+                    wide = side[0] - 2.5 - x
+                else:
+                    x = side[1] + 2.5
+                    continue
+            front = edge + setback + float(rng.uniform(0, 0.8))
+            number = int(rng.integers(1 << 20))
+            if row == "north":
+                houses.append(House(x, x + wide, front, 10.0, tall, wall, number))
+            elif x > 30 or x + wide < -20:
+                houses.append(House(x, x + wide, -front - 14.0, 8.0, tall, wall, number))
+            x += wide + gap
+    return tuple(houses)
+
+
+def _fixtures(
+    rng: np.random.Generator,
+    usual: bool,
+    kerb: float,
+    walk: float,
+    side: tuple[float, float] | None,
+) -> tuple[Fixture, ...]:
+    """Lamps, trees, signs, bins and parked cars; more of them in some places than in others."""
+    out: list[Fixture] = []
+
+    def put(what: str, x: float, y: float, heading: float = 0.0) -> None:
+        if side is not None and side[0] - 1.0 < x < side[1] + 1.0 and abs(y) < 40:
+            return
+        out.append(Fixture(what, (x, y), heading, int(rng.integers(1 << 20))))
+
+    for x in np.arange(-40, 50, float(rng.uniform(14, 22))).tolist():
+        put("lamp", x + 9.5, kerb + 0.6, -np.pi / 2)
+    trees = 9.0 if usual else float(rng.uniform(6, 26))
+    for x in np.arange(-60, 70, trees).tolist():
+        x += float(rng.uniform(-1.5, 1.5)) + 2.0
+        if abs(x - CROSSING_X_M) > 3.2:
+            put("tree", x, kerb + walk - 0.5)
+    put("signal", CROSSING_X_M + 2.9, kerb + 0.5, -np.pi / 2)
+    put("signal", CROSSING_X_M - 2.9, -kerb - 0.5, np.pi / 2)
+    put("bin", float(rng.uniform(8, 14)), kerb + walk - 0.4)
+    put("hydrant", float(rng.uniform(9, 16)), kerb + 0.5)
+    put("sign", float(rng.uniform(8.5, 12)), -kerb - 0.5, np.pi)
+    parked = [(14.0, 1), (20.5, 1), (-14.5, 1)] if usual else []
+    if not usual:
+        for way in (1, -1):
+            if rng.random() < 0.55:
+                parked += [
+                    (float(x) + float(rng.uniform(-0.6, 0.6)), way)
+                    for x in np.arange(-38, 45, 6.4)
+                    if rng.random() < 0.5 and abs(float(x) - CROSSING_X_M) > 6
+                ]
+        for _ in range(int(rng.integers(0, 4))):  # street furniture close to the camera
+            what = str(rng.choice(["bollard", "sign", "bin", "tree", "lamp"]))
+            x = CROSSING_X_M + float(rng.choice([-1, 1])) * float(rng.uniform(1.2, 9.0))
+            put(what, x, float(rng.uniform(-11.0, -kerb - 0.6)), float(rng.uniform(-3, 3)))
+    for x, way in parked:
+        put("car", x, way * (kerb - 1.05), 0.0 if way < 0 else np.pi)
+    return tuple(out)

@@ -1,0 +1,201 @@
+"""A mesh as the camera sees it: colours and coverage of a small part of the picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bikeped.scene.camera import SceneCamera
+from bikeped.scene.conditions import Lighting
+from bikeped.scene.mesh import Mesh
+from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
+
+_SHIFT = 5
+_MARGIN_PX = 2
+#: A sprite may reach this far beyond the picture, as a share of it: what lies there counts as cut
+#: off. More would cost memory for a bus at arm's length.
+_BEYOND = 0.35
+
+
+@dataclass(frozen=True)
+class Sprite:
+    """`colour` [h, w, 3] uint8, already multiplied by `alpha` [h, w] uint8 (255 is covered), with
+    its upper left corner at pixel (`left`, `top`), which may lie outside the picture.
+
+    `full_box_px`: u1, v1, u2, v2 of the whole silhouette; `away_m`: distance that decides who
+    hides whom.
+    """
+
+    left: int
+    top: int
+    colour: ImageArray
+    alpha: ImageArray
+    full_box_px: tuple[float, float, float, float]
+    away_m: float
+
+    @property
+    def area_px(self) -> float:
+        """Covered pixels."""
+        return float(self.alpha.sum(dtype=np.int64)) / 255
+
+
+def rasterise(
+    mesh: Mesh,
+    view: SceneCamera,
+    light: Lighting,
+    *,
+    local: FloatArray | None = None,
+    away_m: float,
+) -> Sprite | None:
+    """Draws `mesh` (world metres); None when nothing of it is in or near the picture.
+
+    `local` [3] is light from lamps at its place, added to the ambient light.
+    """
+    eye = view.eye_m
+    quads = mesh.quads
+    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    middle = quads.mean(axis=1)
+    facing = ((eye - middle) * normal).sum(1) > 0
+    if not facing.any():
+        return None
+    pixels = view.pixels(quads[facing].reshape(-1, 3)).reshape(-1, 4, 2)
+    whole = np.isfinite(pixels).all(axis=(1, 2))
+    if not whole.any():
+        return None
+    kept = np.flatnonzero(facing)[whole]
+    pixels = pixels[whole]
+    low, high = pixels.min(axis=(0, 1)), pixels.max(axis=(0, 1))
+    bounds = _bounds(low, high, view.size)
+    if bounds is None:
+        return None
+    left, top, right, bottom = bounds
+    away = np.linalg.norm(middle[kept] - eye, axis=1)
+    order = np.lexsort((-away, mesh.layer[kept]))
+    colour = shaded(mesh, normal, kept, light, local)[order]
+    scale = _supersampling(float((high - low).max()))
+    fixed = np.round(
+        ((pixels[order] - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)
+    ).astype(np.int32)
+    canvas = np.zeros(((bottom - top) * scale, (right - left) * scale, 4), np.uint8)
+    fill = cv2.fillConvexPoly
+    for points, (r, g, b) in zip(fixed, colour.tolist(), strict=True):
+        fill(canvas, points, (r, g, b, 255), cv2.LINE_8, _SHIFT)
+    if scale > 1:
+        canvas = np.asarray(
+            cv2.resize(canvas, (right - left, bottom - top), interpolation=cv2.INTER_AREA), np.uint8
+        )
+    box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return Sprite(
+        left, top, np.ascontiguousarray(canvas[..., :3]), np.ascontiguousarray(canvas[..., 3]),
+        box, away_m,
+    )  # fmt: skip
+
+
+def shaded(
+    mesh: Mesh,
+    normal: FloatArray,
+    kept: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
+    light: Lighting,
+    local: FloatArray | None,
+) -> FloatArray:
+    """Colours [m, 3] of the faces `kept` under the light: sky from above, sun from its side."""
+    n = normal[kept]
+    n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+    ambient = light.ambient if local is None else light.ambient + local
+    factor = (
+        ambient * (0.86 + 0.20 * n[:, 2:]) + light.sun * np.clip(n @ light.to_sun, 0, 1)[:, None]
+    )
+    glow = mesh.glow[kept][:, None]
+    out: FloatArray = np.clip(mesh.colours[kept] * (factor * (1 - glow) + glow), 0, 255)
+    return out
+
+
+def shadow(
+    quads: FloatArray, view: SceneCamera, to_sun: FloatArray, softness: float
+) -> tuple[int, int, Float32Array] | None:
+    """Where faces [n, 4, 3] keep the sun off the ground: left, top and coverage [h, w] 0..1."""
+    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    lit = quads[(normal @ to_sun) > 0]
+    if len(lit) == 0:
+        return None
+    slope = to_sun[:2] / max(float(to_sun[2]), 0.18)
+    flat = lit.copy()
+    flat[..., :2] -= lit[..., 2:] * slope
+    flat[..., 2] = 0
+    pixels = view.pixels(flat.reshape(-1, 3)).reshape(-1, 4, 2)
+    pixels = pixels[np.isfinite(pixels).all(axis=(1, 2))]
+    if len(pixels) == 0:
+        return None
+    bounds = _bounds(pixels.min(axis=(0, 1)), pixels.max(axis=(0, 1)), view.size, beyond=0.0)
+    if bounds is None:
+        return None
+    left, top, right, bottom = bounds
+    scale = 2 if max(right - left, bottom - top) < 160 else 1
+    canvas = np.zeros(((bottom - top) * scale, (right - left) * scale), np.uint8)
+    fixed = np.round(((pixels - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT))
+    for points in fixed.astype(np.int32):
+        cv2.fillConvexPoly(canvas, points, 255, cv2.LINE_8, _SHIFT)
+    if scale > 1:
+        canvas = np.asarray(
+            cv2.resize(canvas, (right - left, bottom - top), interpolation=cv2.INTER_AREA), np.uint8
+        )
+    blur = max(int(softness), 0) * 2 + 1
+    out = cv2.GaussianBlur(canvas, (blur, blur), 0) if blur > 1 else canvas
+    return left, top, np.asarray(out, np.float32) / 255
+
+
+def halo(radius_px: float) -> Float32Array:
+    """A round glow [2r + 1, 2r + 1] falling from 1 to 0."""
+    r = max(int(radius_px), 1)
+    y, x = np.mgrid[-r : r + 1, -r : r + 1].astype(np.float32)
+    d = np.hypot(x, y) / r
+    core: Float32Array = (np.clip(1 - d, 0, 1) ** 2.5).astype(np.float32)
+    return core
+
+
+def inside(
+    view_size: tuple[int, int], left: int, top: int, width: int, height: int
+) -> tuple[slice, slice, slice, slice] | None:
+    """Rows and columns of the picture and of a patch of this place that overlap."""
+    x0, y0 = max(left, 0), max(top, 0)
+    x1, y1 = min(left + width, view_size[0]), min(top + height, view_size[1])
+    if x1 <= x0 or y1 <= y0:
+        return None
+    return (
+        slice(y0, y1),
+        slice(x0, x1),
+        slice(y0 - top, y1 - top),
+        slice(x0 - left, x1 - left),
+    )
+
+
+def covered(alpha: ImageArray) -> BoolArray:
+    """Which pixels are at least half covered."""
+    return np.asarray(alpha >= 128)
+
+
+def _bounds(
+    low: FloatArray, high: FloatArray, size: tuple[int, int], beyond: float = _BEYOND
+) -> tuple[int, int, int, int] | None:
+    """Pixel bounds of what is drawn, limited to the picture and a little more."""
+    width, height = size
+    if high[0] <= 0 or high[1] <= 0 or low[0] >= width or low[1] >= height:
+        return None
+    left = max(math.floor(low[0]) - _MARGIN_PX, int(-beyond * width))
+    top = max(math.floor(low[1]) - _MARGIN_PX, int(-beyond * height))
+    right = min(math.ceil(high[0]) + _MARGIN_PX, int((1 + beyond) * width))
+    bottom = min(math.ceil(high[1]) + _MARGIN_PX, int((1 + beyond) * height))
+    if right - left < 1 or bottom - top < 1:
+        return None
+    return left, top, right, bottom
+
+
+def _supersampling(longest_px: float) -> int:
+    if longest_px < 60:
+        return 4
+    if longest_px < 140:
+        return 3
+    return 2 if longest_px < 700 else 1
