@@ -9,6 +9,7 @@ import click
 #: Command: module that holds it as `command`, imported only when asked for.
 COMMANDS = {
     "augment": "bikeped.cli.model_augment",
+    "evaluate": "bikeped.cli.model_evaluate",
 }
 
 

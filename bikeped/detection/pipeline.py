@@ -24,7 +24,7 @@ from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.detection.riders import join_riders
 from bikeped.detection.weights import first_layer
 from bikeped.errors import DetectorError
-from bikeped.types import Detections, ImageArray, Kind
+from bikeped.types import Detections, Float32Array, ImageArray, Kind
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -85,6 +85,7 @@ class NetworkDetector:
         if choice.layout == "end2end" and classes is None:
             classes = _coco_if_plausible(answer)
         names = class_names(metadata.names, classes, self._source)
+        self.class_names: tuple[str, ...] = names  #: of the network's own classes, by their number
         self._kind_of_class = kind_table(names, config, self._source)
         self._wanted = self._kind_of_class != UNMAPPED
         faint = RIDDEN_SHARE if config.rider_overlap < 1 else 1.0
@@ -161,6 +162,26 @@ class NetworkDetector:
             found, (filled - start) * 1e3, (answered - filled) * 1e3, (end - answered) * 1e3
         )
 
+    def infer_classes(
+        self, rgb: ImageArray, frame_width: int, frame_height: int, confidence: float
+    ) -> tuple[Detections, Candidates]:
+        """One answer of the network read twice, for measuring a model: as `infer` gives it, and as
+        the candidates of every class of at least `confidence`, in pixels of the full frame and
+        clipped to it, nothing suppressed and nobody joined. Raises as `infer` does.
+        """
+        where = self._preprocess(rgb, frame_width, frame_height)
+        outputs = self._backend.run()
+        if len(outputs) <= self._output:
+            raise DetectorError(f"{self._source}: the network gave no answer")
+        answer = outputs[self._output][1]
+        read = (answer, self._layout, self._size)
+        users = decode(*read, self._least, self._wanted, self._source)
+        every = decode(*read, confidence, np.ones_like(self._wanted), self._source)
+        box = _on_frame(every.box, where)
+        left = (box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1])
+        found = Candidates(box[left], every.score[left], every.class_id[left])
+        return self._road_users(users, where), found
+
     def _road_users(self, candidates: Candidates, where: Letterbox) -> Detections:
         """Candidates as detections on the frame: one box an object, riders joined."""
         score = candidates.score
@@ -170,9 +191,7 @@ class NetworkDetector:
         else:
             strongest = np.arange(len(score))
         kind = self._kind_of_class[candidates.class_id[strongest]]
-        box = where.inverse(candidates.box[strongest])
-        edge = np.array([where.frame_width, where.frame_height] * 2, np.float32)
-        box = np.minimum(np.maximum(box, np.float32(0)), edge)
+        box = _on_frame(candidates.box[strongest], where)
         # What lay on the grey rest has no area left. Boxes of one kind suppress one another
         # whatever their class: a car that is also a truck is one vehicle.
         on_frame = np.nonzero((box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1]))[0]
@@ -193,6 +212,13 @@ class NetworkDetector:
                 self._config.max_detections,
             )
         )
+
+
+def _on_frame(box: Float32Array, where: Letterbox) -> Float32Array:
+    """Boxes [n, 4] in input pixels in pixels of the frame, clipped to it."""
+    edge = np.array([where.frame_width, where.frame_height] * 2, np.float32)
+    clipped: Float32Array = np.minimum(np.maximum(where.inverse(box), np.float32(0)), edge)
+    return clipped
 
 
 def _coco_if_plausible(answer: npt.NDArray[Any]) -> int | None:

@@ -1,0 +1,206 @@
+"""`bikeped model evaluate`: detectors over a data set by COCO's measures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
+from bikeped.cli.conformance_shared import print_table
+from bikeped.cli.guard import check_outputs, guarded
+from bikeped.config import load_config
+from bikeped.errors import BikepedError
+
+if TYPE_CHECKING:
+    from bikeped.conformance.tables import Cell, Table
+    from bikeped.training.evaluate import Evaluation
+    from bikeped.training.measures import Row
+
+
+@click.command("evaluate")
+@click.argument("models", nargs=-1, required=True, metavar="MODEL...")
+@click.argument("data", type=click.Path(path_type=Path))
+@config_options
+@click.option(
+    "--images",
+    "images_dir",
+    type=click.Path(path_type=Path),
+    help="Folder that the data's file names start from, where it is not found by itself.",
+)
+@click.option(
+    "--confidence",
+    type=click.FloatRange(0.0001, 1),
+    default=0.001,
+    show_default=True,
+    help="Least confidence for classes and merged kinds; what is deployed has its own.",
+)
+@click.option(
+    "--iou",
+    type=click.FloatRange(0.01, 1),
+    default=0.65,
+    show_default=True,
+    help="Overlap at which the weaker box goes, for classes and merged kinds.",
+)
+@click.option(
+    "--curve",
+    "curve_out",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Recall against area of the last MODEL, as conformance reads it with --recall-curve.",
+)
+@click.option(
+    "--curve-iou",
+    type=click.Choice(["coco", "0.5"]),
+    default="coco",
+    show_default=True,
+    help="Recall as the mean over IoU 0.50 to 0.95 (the paper's), or at IoU 0.50.",
+)
+@click.option(
+    "--least-objects",
+    type=click.IntRange(1),
+    default=20,
+    show_default=True,
+    help="A bin of the curve with fewer objects joins the next.",
+)
+@click.option(
+    "--figure",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw it as PNG, and as PDF beside it.",
+)
+@json_option
+@guarded
+def command(
+    models: tuple[str, ...],
+    data: Path,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    images_dir: Path | None,
+    confidence: float,
+    iou: float,
+    curve_out: Path | None,
+    curve_iou: str,
+    least_objects: int,
+    figure: Path | None,
+    json_path: str | None,
+) -> int:
+    """Measure each MODEL (FILE or NAME=FILE) over DATA in COCO's format.
+
+    With several models each is compared with the first: original before fisheye-trained.
+    """
+    from bikeped.training.coco import read_coco
+    from bikeped.training.evaluate import EvaluationSettings, evaluate, load_models, write_curve
+
+    if figure is not None:
+        from bikeped.conformance.figure_style import require_matplotlib
+
+        require_matplotlib()
+        if figure.suffix != ".png":
+            raise BikepedError(f"--figure {figure}: is no .png; name one, a PDF comes beside it")
+    source = read_coco(data, images_dir)
+    named = [_named(word) for word in models]
+    outputs = [("--curve", curve_out), ("--figure", figure)]
+    if figure is not None:
+        outputs.append(("--figure", figure.with_suffix(".pdf")))
+    if json_path not in (None, "-"):
+        outputs.append(("--json", Path(str(json_path))))
+    check_outputs(
+        [
+            ("DATA", source.source),
+            *(("DATA", image.path) for image in source.images),
+            *(("MODEL", path) for _, path in named),
+        ],
+        [(name, path) for name, path in outputs if path is not None],
+    )
+    detection = load_config(config_path, overrides).config.detection
+    loaded = load_models(named, detection)
+    settings = EvaluationSettings(confidence, iou, least_objects)
+    with progress_bar("evaluate", len(source.images)) as progress:
+        result = evaluate(source, loaded, detection, settings, progress)
+    written: list[Path] = []
+    if curve_out is not None:
+        write_curve(curve_out, result.scores[-1].curve, curve_iou == "0.5")
+        written.append(curve_out)
+    if figure is not None:
+        from bikeped.training.evaluation_figures import draw_evaluation
+
+        written += draw_evaluation(result, figure)
+    if json_path is not None:
+        write_json(result.as_dict(), json_path)
+    if json_path != "-":
+        screen = console()
+        for table in tables(result):
+            print_table(screen, table)
+            screen.print()
+        for path in written:
+            click.echo(f"wrote {path}")
+    return 0
+
+
+def tables(result: Evaluation) -> list[Table]:
+    """The paper's detection table, by size, and by class where there is more than one."""
+    from bikeped.conformance.tables import Table
+    from bikeped.training.evaluation_figures import evaluation_rows
+
+    rows = [evaluation_rows(score) for score in result.scores]
+    data = result.data
+    unknown = data["categories_not_known_to_every_model"]
+    note = f"{data['images']} pictures, {data['objects']} objects"
+    if unknown:
+        some = ", ".join(unknown[:6]) + (", ..." if len(unknown) > 6 else "")
+        note += f"; not known to every model and so left out of the classes: {some}"
+    main = Table("detection", "detection", *_compared(result, rows), note)
+    sizes = Table(
+        "by_size",
+        "recall by area at the network's input: small < 32^2, medium < 96^2, large",
+        ("", *(f"{s.label} {n}" for s in result.scores for n in ("small", "medium", "large"))),
+        [
+            (name, *(_three(v) for score in rows for v in score[index][1].ar_by_size))
+            for index, (name, _) in enumerate(rows[0])
+        ],
+    )
+    found = [main, sizes]
+    if all(score.classes is not None for score in result.scores):
+        by_class = [
+            [(row.name, row) for row in score.classes.rows if row.objects]
+            for score in result.scores
+            if score.classes is not None
+        ]
+        if len(by_class[0]) > 1:
+            found.append(Table("classes", "by class", *_compared(result, by_class)))
+    return found
+
+
+def _compared(
+    result: Evaluation, rows: list[list[tuple[str, Row]]]
+) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
+    """Columns and rows: AP, AP50 and recall of each model, and AP against the first model's."""
+    columns = ["", "objects"]
+    for number, score in enumerate(result.scores):
+        columns += [f"{score.label} AP", "AP50", "recall"] + (["AP ratio"] if number else [])
+    lines: list[tuple[Cell, ...]] = []
+    for index, (name, first) in enumerate(rows[0]):
+        line: list[Cell] = [name, first.objects]
+        for number, own in enumerate(rows):
+            row = own[index][1]
+            line += [_three(row.ap), _three(row.ap50), _three(row.ar)]
+            if number:
+                both = row.ap is not None and first.ap
+                line.append(round(row.ap / first.ap, 2) if both else None)  # type: ignore[operator]
+        lines.append(tuple(line))
+    return tuple(columns), lines
+
+
+def _three(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+def _named(word: str) -> tuple[str, Path]:
+    """NAME=FILE, or a file that is called by its own name."""
+    path = Path(word)
+    name, equals, file = word.partition("=")
+    if equals and name and not path.exists():
+        return name, Path(file)
+    return path.stem, path

@@ -1,0 +1,395 @@
+"""Detectors measured over a data set: the paper's detection table for any model and any data.
+
+Three readings of the same answers of the network:
+
+`classes`     the network's own classes against the data's, by name: COCO's ordinary measures.
+`merged`      classes merged to pedestrian, cyclist and vehicle by the names in `detection`, as in
+              the paper's table: a bicycle is a bicycle's box, and its rider a person.
+`road_users`  what the deployed detector hands to the tracker, at its confidence and suppression,
+              with riders joined to their cycles. The truth is joined by the very same rule
+              (`detection/riders.py`): a person on a bicycle and the bicycle are one cyclist, whose
+              box holds both. Data that name whole cyclists (`cyclist`) are taken as they are.
+
+The simulation's objects are road users, so its recall curve is read from the third.
+
+Areas are square pixels at a network input of 1280 pixels, whatever the picture's own size: a
+picture of w x h counts as scaled by 1280 / max(w, h), as it is letterboxed. For the sensor's
+3840 x 2160 this is the definitions' (1280/3840)^2. The curve keeps that unit for a smaller network,
+too, for the simulation asks in it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bikeped.config.sections import DetectionConfig
+from bikeped.detection import load_detector
+from bikeped.detection.layouts import Candidates
+from bikeped.detection.nms import suppress
+from bikeped.detection.pipeline import NetworkDetector
+from bikeped.detection.riders import join_riders
+from bikeped.errors import DataSetError
+from bikeped.files import write_whole
+from bikeped.training.coco import CocoData, CocoObject, read_picture
+from bikeped.training.measures import (
+    Curve,
+    Found,
+    Measures,
+    Truth,
+    measure,
+    recall_curve,
+    require_pycocotools,
+)
+from bikeped.types import Detections, Kind
+
+#: Side of the network input that areas are measured at (definitions, section 3).
+INPUT_PX = 1280
+KIND_NAMES = tuple(kind.label for kind in Kind)
+#: Classes whose box holds the cycle alone; any other cyclist's box holds the rider, too.
+BARE_CYCLES = frozenset({"bicycle", "motorcycle"})
+_MOST_OF_A_PICTURE = 300  # more than the measures read
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """`confidence` and `iou` are those of `classes` and `merged`; `road_users` is as deployed."""
+
+    confidence: float = 0.001
+    iou: float = 0.65
+    least_objects: int = 20  #: of a bin of the recall curve
+
+
+@dataclass(frozen=True)
+class ModelUnderTest:
+    """A loaded model by the name that tables call it."""
+
+    label: str
+    path: Path
+    detector: NetworkDetector
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Everything measured of one model."""
+
+    label: str
+    facts: dict[str, Any]
+    classes: Measures | None  #: None where model and data share no class
+    merged: Measures
+    road_users: Measures
+    curve: Curve
+    curves: dict[str, Curve]  #: the same by kind
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Models measured over the same data, in the order given: the first is compared against."""
+
+    data: dict[str, Any]
+    settings: dict[str, Any]
+    scores: tuple[Scores, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "data": self.data,
+            "settings": self.settings,
+            "models": [
+                {
+                    "label": score.label,
+                    **score.facts,
+                    **{
+                        name: None
+                        if part is None
+                        else {
+                            "all": part.overall.as_dict(),
+                            "rows": [row.as_dict() for row in part.rows],
+                        }
+                        for name, part in (
+                            ("classes", score.classes),
+                            ("merged", score.merged),
+                            ("road_users", score.road_users),
+                        )
+                    },
+                    "recall_curve": {
+                        "all": score.curve.as_dict(),
+                        **{name: curve.as_dict() for name, curve in score.curves.items()},
+                    },
+                }
+                for score in self.scores
+            ],
+        }
+
+
+def load_models(
+    named: Sequence[tuple[str, Path]], detection: DetectionConfig
+) -> list[ModelUnderTest]:
+    """Model files by label, loaded with the `detection` section but for its own model.
+
+    Raises DetectorError for a file that cannot be run, DataSetError for two of one name.
+    """
+    labels = [label for label, _ in named]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise DataSetError(f"MODEL: two are called {label!r}; name them apart with NAME=FILE")
+    models = []
+    for label, path in named:
+        config = msgspec.structs.replace(detection, model=str(path.absolute()), sha256=None)
+        detector = load_detector(config, Path())
+        if not isinstance(detector, NetworkDetector):
+            raise DataSetError(f"{path}: its classes cannot be read; name an .onnx or .engine file")
+        models.append(ModelUnderTest(label, path, detector))
+    return models
+
+
+def evaluate(
+    data: CocoData,
+    models: Sequence[ModelUnderTest],
+    detection: DetectionConfig,
+    settings: EvaluationSettings | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Evaluation:
+    """Runs every model over every picture once, and measures.
+
+    Raises DataSetError for data without road users (by the names in `detection`) and for pictures
+    that cannot be read.
+    """
+    require_pycocotools()
+    settings = settings or EvaluationSettings()
+    kind_of = _kinds(data.categories, detection)
+    if not kind_of or not any(
+        thing.category_id in kind_of and not thing.crowd
+        for found in data.objects.values()
+        for thing in found
+    ):
+        raise DataSetError(
+            f"{data.source}: holds no pedestrian, cyclist or vehicle by the names in "
+            "detection.pedestrian, detection.cyclist and detection.vehicle; name its categories "
+            "there"
+        )
+    known = [{_plain(name) for name in model.detector.class_names} for model in models]
+    shared = [i for i, name in data.categories.items() if all(_plain(name) in k for k in known)]
+    gathered = [_Gathered(model, data, shared, detection, settings) for model in models]
+    for done, image in enumerate(data.images):
+        picture = read_picture(image)
+        scale = INPUT_PX / max(image.width, image.height)
+        for model, its in zip(models, gathered, strict=True):
+            users, every = model.detector.infer_classes(
+                picture, image.width, image.height, settings.confidence
+            )
+            its.add(done, users, every, scale)
+        progress(done + 1)
+    truths = (
+        _truth(data, {category: n for n, category in enumerate(shared)}),
+        _truth(data, {category: int(kind) for category, kind in kind_of.items()}),
+        _joined_truth(data, kind_of, detection),
+    )
+    names = [data.categories[category] for category in shared]
+    return Evaluation(
+        {
+            "source": str(data.source),
+            "sha256": data.sha256,
+            "images": len(data.images),
+            "objects": data.count,
+            "crowds": sum(t.crowd for found in data.objects.values() for t in found),
+            "boxes_without_area": data.empty,
+            "categories_not_known_to_every_model": [
+                name for i, name in data.categories.items() if i not in shared
+            ],
+        },
+        {
+            "area_input_px": INPUT_PX,
+            "confidence": settings.confidence,
+            "iou": settings.iou,
+            "least_objects": settings.least_objects,
+            "deployed_confidence": detection.confidence,
+            "deployed_iou": detection.iou,
+            "rider_overlap": detection.rider_overlap,
+        },
+        tuple(its.score(truths, names, len(data.images), settings) for its in gathered),
+    )
+
+
+def write_curve(path: Path, curve: Curve, at_iou_50: bool = False) -> None:
+    """Writes a recall curve as the conformance simulation reads it with `--recall-curve`.
+
+    CSV, or JSON where the name ends so. `at_iou_50` writes recall at IoU 0.50 instead of the mean
+    over 0.50 to 0.95. Raises DataSetError for a curve of fewer than two bins.
+    """
+    if len(curve.area_px2) < 2:
+        raise DataSetError(
+            f"{path}: the data have too few road users for a recall curve of two bins or more; "
+            "evaluate more pictures, or lower --least-objects"
+        )
+    recall = curve.recall50 if at_iou_50 else curve.recall
+    if path.suffix == ".json":
+        body = {"area_px2": list(curve.area_px2), "recall": list(recall)}
+        write_whole(path, json.dumps({**body, "objects": list(curve.objects)}, indent=2) + "\n")
+        return
+    pairs = zip(curve.area_px2, recall, strict=True)
+    lines = [f"{area!r},{share!r}" for area, share in pairs]
+    write_whole(path, "\n".join(["area_px2,recall", *lines]) + "\n")
+
+
+class _Gathered:
+    """What one model found in all pictures, for the three readings."""
+
+    def __init__(
+        self,
+        model: ModelUnderTest,
+        data: CocoData,
+        shared: Sequence[int],
+        detection: DetectionConfig,
+        settings: EvaluationSettings,
+    ) -> None:
+        self._model = model
+        self._iou = settings.iou
+        names = model.detector.class_names
+        place = {_plain(data.categories[category]): n for n, category in enumerate(shared)}
+        kinds = _kinds(dict(enumerate(names)), detection)
+        self._class_of = np.array([place.get(_plain(name), -1) for name in names], np.int64)
+        self._kind_of = np.array([int(kinds.get(n, -1)) for n in range(len(names))], np.int64)
+        self._parts: tuple[list[_Part], ...] = ([], [], [])
+
+    def add(self, image: int, users: Detections, every: Candidates, scale: float) -> None:
+        """The answers for one picture; boxes become pixels at the network's input."""
+        for part, group_of in ((0, self._class_of), (1, self._kind_of)):
+            group = group_of[every.class_id]
+            wanted = group >= 0
+            box, score, group = every.box[wanted], every.score[wanted], group[wanted]
+            keep = suppress(box, score, group, self._iou, _MOST_OF_A_PICTURE)
+            self._parts[part].append(_Part(image, group[keep], box[keep] * scale, score[keep]))
+        kind = users.kind.astype(np.int64)
+        self._parts[2].append(_Part(image, kind, users.box_px * scale, users.confidence))
+
+    def score(
+        self,
+        truths: tuple[Truth, Truth, Truth],
+        names: Sequence[str],
+        images: int,
+        settings: EvaluationSettings,
+    ) -> Scores:
+        """Measures everything that was added."""
+        found = [_all_of(parts) for parts in self._parts]
+        users = measure(truths[2], found[2], KIND_NAMES, images)
+        detector = self._model.detector
+        return Scores(
+            self._model.label,
+            {
+                "file": str(self._model.path),
+                "sha256": detector.model_hash,
+                "input_px": list(detector.input_size),
+                "classes_in_model": len(detector.class_names),
+            },
+            measure(truths[0], found[0], names, images) if names else None,
+            measure(truths[1], found[1], KIND_NAMES, images),
+            users,
+            recall_curve(truths[2], users.hits, settings.least_objects),
+            {
+                kind.label: recall_curve(truths[2], users.hits, settings.least_objects, int(kind))
+                for kind in Kind
+            },
+        )
+
+
+@dataclass(frozen=True)
+class _Part:
+    image: int
+    category: Any
+    box_px: Any
+    score: Any
+
+
+def _all_of(parts: Sequence[_Part]) -> Found:
+    none = [np.zeros(0)]
+    return Found(
+        np.concatenate([np.full(len(p.score), p.image) for p in parts] or none).astype(np.int64),
+        np.concatenate([p.category for p in parts] or none).astype(np.int64),
+        np.concatenate([p.box_px for p in parts] or [np.zeros((0, 4))]).astype(np.float64),
+        np.concatenate([p.score for p in parts] or none).astype(np.float32),
+    )
+
+
+def _kinds(names: dict[int, str] | Any, detection: DetectionConfig) -> dict[int, Kind]:
+    """Which of the named classes are which kind of road user."""
+    wanted = {
+        _plain(name): kind
+        for kind, given in (
+            (Kind.PEDESTRIAN, detection.pedestrian),
+            (Kind.CYCLIST, detection.cyclist),
+            (Kind.VEHICLE, detection.vehicle),
+        )
+        for name in given
+    }
+    return {i: wanted[_plain(name)] for i, name in names.items() if _plain(name) in wanted}
+
+
+def _truth(data: CocoData, group_of: dict[int, int]) -> Truth:
+    """The data's boxes, their categories mapped by `group_of`; others are left out."""
+    image, group, box, crowd = [], [], [], []
+    for number, picture in enumerate(data.images):
+        scale = INPUT_PX / max(picture.width, picture.height)
+        for thing in data.objects[picture.id]:
+            if thing.category_id in group_of:
+                image.append(number)
+                group.append(group_of[thing.category_id])
+                box.append(np.multiply(thing.box_px, scale))
+                crowd.append(thing.crowd)
+    return _as_truth(image, group, box, crowd)
+
+
+def _joined_truth(data: CocoData, kind_of: dict[int, Kind], detection: DetectionConfig) -> Truth:
+    """The data's road users as the deployed detector means them: riders joined to their cycles."""
+    image, group, box, crowd = [], [], [], []
+    for number, picture in enumerate(data.images):
+        scale = INPUT_PX / max(picture.width, picture.height)
+        things = [t for t in data.objects[picture.id] if t.category_id in kind_of]
+        apart = [t for t in things if t.crowd or not _may_join(t, data, kind_of)]
+        parts = [t for t in things if not t.crowd and _may_join(t, data, kind_of)]
+        joined = join_riders(
+            Detections(
+                np.array([kind_of[t.category_id] for t in parts], np.int8),
+                np.ones(len(parts), np.float32),
+                np.array([t.box_px for t in parts], np.float32).reshape(-1, 4),
+            ),
+            detection.rider_overlap,
+            detection.confidence,
+        )
+        for kind, place in zip(joined.kind.tolist(), joined.box_px, strict=True):
+            image.append(number)
+            group.append(kind)
+            box.append(place.astype(np.float64) * scale)
+            crowd.append(False)
+        for thing in apart:
+            image.append(number)
+            group.append(int(kind_of[thing.category_id]))
+            box.append(np.multiply(thing.box_px, scale))
+            crowd.append(thing.crowd)
+    return _as_truth(image, group, box, crowd)
+
+
+def _may_join(thing: CocoObject, data: CocoData, kind_of: dict[int, Kind]) -> bool:
+    """People, and cycles whose box does not hold the rider already."""
+    if kind_of[thing.category_id] is Kind.CYCLIST:
+        return _plain(data.categories[thing.category_id]) in BARE_CYCLES
+    return kind_of[thing.category_id] is Kind.PEDESTRIAN
+
+
+def _as_truth(image: list[int], group: list[int], box: list[Any], crowd: list[bool]) -> Truth:
+    return Truth(
+        np.array(image, np.int64),
+        np.array(group, np.int64),
+        np.array(box, np.float64).reshape(-1, 4),
+        np.array(crowd, np.bool_),
+    )
+
+
+def _plain(name: str) -> str:
+    return name.strip().lower()

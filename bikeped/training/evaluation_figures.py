@@ -1,0 +1,109 @@
+"""The evaluation drawn: precision and recall side by side, and recall against area."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bikeped.conformance.figure_style import SERIES, Sheet, plain, reals
+from bikeped.training.evaluate import Evaluation, Scores
+from bikeped.training.measures import Row
+
+_TICKS = (4, 8, 16, 32, 64, 96, 128, 256, 512, 1024)  # sides of squares on the axis of areas
+
+
+def evaluation_rows(score: Scores) -> list[tuple[str, Row]]:
+    """The rows of the table that people read: all classes, then the three kinds, both ways."""
+    rows = []
+    if score.classes is not None:
+        known = sum(row.objects > 0 for row in score.classes.rows)
+        rows.append((f"all classes ({known})", score.classes.overall))
+    rows += [(f"{row.name}, merged", row) for row in score.merged.rows]
+    rows += [(f"{row.name}, as deployed", row) for row in score.road_users.rows]
+    return rows
+
+
+def draw_evaluation(evaluation: Evaluation, path: Path) -> list[Path]:
+    """Draws PNG and PDF beside one another; `path` names the PNG. Gives what was written.
+
+    Raises BikepedError without matplotlib, or where a file cannot be written.
+    """
+    data = evaluation.data
+    labels = ", ".join(score.label for score in evaluation.scores)
+    least = evaluation.settings["deployed_confidence"]
+    caption = (
+        f"{data['images']} pictures, {data['objects']} objects. AP: average precision over IoU "
+        "0.50 to 0.95. Recall: its mean over the same, at most 100 boxes a picture. Merged: "
+        "bicycle and motorcycle are cyclists, riders pedestrians. As deployed: a rider and the "
+        f"cycle are one cyclist; detections of at least {least:g}. Right: what is deployed, all "
+        "road users together; full: the mean over IoU 0.50 to 0.95, dotted: at 0.50; areas at a "
+        "network input of 1280; below each bin the number of its objects."
+    )
+    count = len(evaluation.scores)
+    with Sheet(
+        f"Detection: {labels}",
+        caption,
+        width=9.6,
+        height=3.4 + 0.25 * count,
+        columns=3,
+        legend_rows=1 + (count - 1) // 4,
+        width_ratios=[1, 1, 1.35],
+    ) as sheet:
+        _bars(sheet, evaluation, 0, "AP")
+        _bars(sheet, evaluation, 1, "Recall")
+        _curves(sheet, evaluation.scores, 2)
+        sheet.axes[1].tick_params(labelleft=False)
+        handles, _ = sheet.axes[0].get_legend_handles_labels()
+        sheet.legend(handles)
+        return sheet.save(path.parent, path.stem)
+
+
+def _bars(sheet: Sheet, evaluation: Evaluation, panel: int, what: str) -> None:
+    axes = sheet.axes[panel]
+    count = len(evaluation.scores)
+    thick = 0.8 / count
+    names = [name for name, _ in evaluation_rows(evaluation.scores[0])]
+    place = np.arange(len(names), dtype=np.float64)
+    for number, score in enumerate(evaluation.scores):
+        rows = [row for _, row in evaluation_rows(score)]
+        values = reals([row.ap if what == "AP" else row.ar for row in rows])
+        colour = SERIES[number % len(SERIES)][0]
+        at = place + (number - (count - 1) / 2) * thick
+        axes.barh(at, np.nan_to_num(values), thick * 0.9, color=colour, label=plain(score.label))
+        for y, value in zip(at, values, strict=True):
+            text = "-" if np.isnan(value) else f"{value:.2f}"
+            axes.text(np.nan_to_num(value) + 0.02, y, text, va="center", fontsize=7)
+    axes.set_yticks(place, [plain(name) for name in names])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.19)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1])
+    axes.set_title(what)
+    axes.grid(False, axis="y")
+
+
+def _curves(sheet: Sheet, scores: Sequence[Scores], panel: int) -> None:
+    axes = sheet.axes[panel]
+    for number, score in enumerate(scores):
+        colour, marker, _ = SERIES[number % len(SERIES)]
+        curve = score.curve
+        if not curve.area_px2:
+            continue
+        axes.plot(curve.area_px2, curve.recall, color=colour, marker=marker)
+        axes.plot(curve.area_px2, curve.recall50, color=colour, marker=marker, ls=":", mfc="white")
+    first = scores[0].curve
+    for area, objects in zip(first.area_px2, first.objects, strict=True):
+        axes.annotate(
+            str(objects), (area, -0.02), fontsize=6.5, ha="center", va="top", annotation_clip=False
+        )
+    if first.area_px2:
+        axes.set_xscale("log")
+        axes.set_xlim(first.area_px2[0] / 1.6, first.area_px2[-1] * 1.6)
+        sides = [s for s in _TICKS if first.area_px2[0] / 1.6 < s**2 < first.area_px2[-1] * 1.6]
+        axes.set_xticks([side**2 for side in sides], [f"{side}\u00b2" for side in sides])
+        axes.minorticks_off()
+    axes.set_ylim(-0.1, 1.02)
+    axes.set_yticks([0, 0.25, 0.5, 0.75, 1])
+    axes.set_title("Recall against area")
+    axes.set_xlabel("box area, square pixels")

@@ -1,0 +1,276 @@
+"""COCO's measures over boxes, by pycocotools, and recall against area.
+
+Average precision is the mean over IoU 0.50, 0.55, ... 0.95 of the area under the interpolated
+precision-recall curve; average recall the mean over the same of the largest recall with at most 100
+boxes a picture (cocodataset.org, "Detection evaluation"). A crowd region neither counts nor harms.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bikeped.conformance.perception import SIZE_BOUNDS_PX2
+from bikeped.errors import BikepedError
+from bikeped.types import BoolArray, Float32Array, FloatArray, IntArray
+
+MOST_BOXES = 100  #: of one picture and class, as COCO has it
+#: Edges of the area bins of the recall curve, square pixels at the network's input.
+BIN_EDGES_PX2: tuple[float, ...] = tuple(
+    float(side) ** 2 for side in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 512)
+)
+_HUGE = 1e10
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Objects of all pictures: `image` [n], `category` [n] from 0, `box_px` [n, 4], `crowd` [n]."""
+
+    image: IntArray
+    category: IntArray
+    box_px: FloatArray
+    crowd: BoolArray
+
+    @property
+    def area_px2(self) -> FloatArray:
+        """[n] of the boxes."""
+        return _area(self.box_px)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Detections of all pictures: as `Truth`, with `score` [n] in 0..1."""
+
+    image: IntArray
+    category: IntArray
+    box_px: FloatArray
+    score: Float32Array
+
+
+@dataclass(frozen=True)
+class Row:
+    """The measures of one class; None where there is no object to measure by."""
+
+    name: str
+    objects: int
+    ap: float | None
+    ap50: float | None
+    ar: float | None
+    ar_by_size: tuple[float | None, float | None, float | None]  #: small, medium, large
+    objects_by_size: tuple[int, int, int]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        small, medium, large = self.ar_by_size
+        return {
+            "name": self.name,
+            "objects": self.objects,
+            "ap": self.ap,
+            "ap50": self.ap50,
+            "ar": self.ar,
+            "ar_small": small,
+            "ar_medium": medium,
+            "ar_large": large,
+            "objects_by_size": list(self.objects_by_size),
+        }
+
+
+@dataclass(frozen=True)
+class Measures:
+    """`rows` a class, `overall` the mean over classes that have objects.
+
+    `hits` [n, 10]: whether each object of the truth was found, at IoU 0.50 ... 0.95.
+    """
+
+    rows: tuple[Row, ...]
+    overall: Row
+    hits: BoolArray
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Recall against area: per bin the mean area of its objects, recall, and how many they are.
+
+    `recall` is the mean over IoU 0.50 ... 0.95, `recall50` at 0.50.
+    """
+
+    area_px2: tuple[float, ...]
+    recall: tuple[float, ...]
+    recall50: tuple[float, ...]
+    objects: tuple[int, ...]
+
+    def as_dict(self) -> dict[str, list[float] | list[int]]:
+        """For JSON."""
+        return {
+            "area_px2": list(self.area_px2),
+            "recall": list(self.recall),
+            "recall50": list(self.recall50),
+            "objects": list(self.objects),
+        }
+
+
+def measure(truth: Truth, found: Found, names: Sequence[str], images: int) -> Measures:
+    """COCO's measures of detections in pictures 0 ... `images` - 1.
+
+    Boxes are in pixels at the network's input: their areas make small, medium and large (32 and 96
+    pixels squared).
+    """
+    evaluation = _evaluation(truth, found, len(names), images)
+    precision, recall = evaluation.eval["precision"], evaluation.eval["recall"]
+    bins = np.searchsorted(SIZE_BOUNDS_PX2, truth.area_px2, side="right")
+    rows = []
+    for index, name in enumerate(names):
+        own = (truth.category == index) & ~truth.crowd
+        sizes = [int(np.count_nonzero(own & (bins == size))) for size in range(3)]
+        rows.append(
+            Row(
+                name,
+                int(np.count_nonzero(own)),
+                _mean(precision[:, :, index, 0, -1]),
+                _mean(precision[0, :, index, 0, -1]),
+                _mean(recall[:, index, 0, -1]),
+                tuple(_mean(recall[:, index, size, -1]) for size in (1, 2, 3)),  # type: ignore[arg-type]
+                (sizes[0], sizes[1], sizes[2]),
+            )
+        )
+    return Measures(tuple(rows), _overall(rows), _hits(evaluation, len(truth.image)))
+
+
+def recall_curve(
+    truth: Truth, hits: BoolArray, least_objects: int, category: int | None = None
+) -> Curve:
+    """Recall over area bins, of all classes together or of one.
+
+    A bin with fewer than `least_objects` objects joins the next larger one, the last one the one
+    before: a share of three objects is no recall. Without objects the curve is empty.
+    """
+    own = ~truth.crowd
+    if category is not None:
+        own = own & (truth.category == category)
+    area, hit = truth.area_px2[own], hits[own]
+    which = np.searchsorted(BIN_EDGES_PX2, area, side="right")
+    groups: list[BoolArray] = []
+    open_group = np.zeros(len(area), np.bool_)
+    for number in range(len(BIN_EDGES_PX2) + 1):
+        open_group = open_group | (which == number)
+        if np.count_nonzero(open_group) >= max(least_objects, 1):
+            groups.append(open_group)
+            open_group = np.zeros(len(area), np.bool_)
+    if open_group.any():
+        groups = [*groups[:-1], groups[-1] | open_group] if groups else [open_group]
+    return Curve(
+        tuple(float(area[group].mean()) for group in groups),
+        tuple(float(hit[group].mean()) for group in groups),
+        tuple(float(hit[group, 0].mean()) for group in groups),
+        tuple(int(np.count_nonzero(group)) for group in groups),
+    )
+
+
+def require_pycocotools() -> None:
+    """BikepedError with the mend when the measuring library is not installed."""
+    try:
+        import pycocotools.cocoeval  # noqa: F401
+    except ImportError as error:
+        raise BikepedError(
+            'pycocotools: not installed, and evaluation needs it; pip install "bikeped[evaluate]"'
+        ) from error
+
+
+def _evaluation(truth: Truth, found: Found, classes: int, images: int) -> Any:
+    require_pycocotools()
+    from pycocotools.cocoeval import COCOeval
+
+    gt_area, dt_area = truth.area_px2, _area(found.box_px)
+    # Numbers from 1: a match is told by the other's number, and 0 means none.
+    gt = [
+        {
+            "id": i + 1,
+            "image_id": int(truth.image[i]),
+            "category_id": int(truth.category[i]),
+            "bbox": _xywh(truth.box_px[i]),
+            "area": float(gt_area[i]),
+            "iscrowd": int(truth.crowd[i]),
+        }
+        for i in range(len(truth.image))
+    ]
+    dt = [
+        {
+            "id": i + 1,
+            "image_id": int(found.image[i]),
+            "category_id": int(found.category[i]),
+            "bbox": _xywh(found.box_px[i]),
+            "area": float(dt_area[i]),
+            "score": float(found.score[i]),
+        }
+        for i in range(len(found.image))
+    ]
+    with contextlib.redirect_stdout(io.StringIO()):  # it tells its progress there
+        evaluation = COCOeval(
+            _coco(gt, classes, images), _coco(dt, classes, images), iouType="bbox"
+        )
+        small, medium = SIZE_BOUNDS_PX2
+        evaluation.params.areaRng = [[0, _HUGE], [0, small], [small, medium], [medium, _HUGE]]
+        evaluation.params.areaRngLbl = ["all", "small", "medium", "large"]
+        evaluation.params.maxDets = [MOST_BOXES]
+        evaluation.evaluate()
+        evaluation.accumulate()
+    return evaluation
+
+
+def _coco(annotations: list[dict[str, Any]], classes: int, images: int) -> Any:
+    from pycocotools.coco import COCO
+
+    coco = COCO()
+    coco.dataset = {
+        "images": [{"id": i} for i in range(images)],
+        "categories": [{"id": i} for i in range(classes)],
+        "annotations": annotations,
+    }
+    coco.createIndex()
+    return coco
+
+
+def _hits(evaluation: Any, objects: int) -> BoolArray:
+    hits = np.zeros((objects, len(evaluation.params.iouThrs)), np.bool_)
+    everything = evaluation.params.areaRng[0]
+    for judged in evaluation.evalImgs:
+        if judged is not None and judged["aRng"] == everything:
+            index = np.asarray(judged["gtIds"], np.int64) - 1
+            hits[index] = (np.asarray(judged["gtMatches"]) > 0).T
+    return hits
+
+
+def _overall(rows: Sequence[Row]) -> Row:
+    def mean(values: list[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        return float(np.mean(known)) if known else None
+
+    return Row(
+        "all",
+        sum(row.objects for row in rows),
+        mean([row.ap for row in rows]),
+        mean([row.ap50 for row in rows]),
+        mean([row.ar for row in rows]),
+        tuple(mean([row.ar_by_size[size] for row in rows]) for size in range(3)),  # type: ignore[arg-type]
+        tuple(sum(row.objects_by_size[size] for row in rows) for size in range(3)),  # type: ignore[arg-type]
+    )
+
+
+def _mean(values: FloatArray) -> float | None:
+    """The mean of what could be measured: pycocotools says -1 where there was nothing."""
+    known = values[values > -1]
+    return float(known.mean()) if known.size else None
+
+
+def _area(box_px: FloatArray) -> FloatArray:
+    return np.asarray((box_px[:, 2] - box_px[:, 0]) * (box_px[:, 3] - box_px[:, 1]))
+
+
+def _xywh(box: FloatArray) -> list[float]:
+    x1, y1, x2, y2 = box.tolist()
+    return [x1, y1, x2 - x1, y2 - y1]
