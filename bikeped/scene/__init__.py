@@ -9,8 +9,10 @@ from bikeped.scene.camera import (
     rectilinear_camera,
     scene_camera,
 )
-from bikeped.scene.chance import random_scenario
+from bikeped.scene.chance import random_camera, random_scenario
+from bikeped.scene.clip import ClipTruth, read_sidecar, sidecar_path, write_clip
 from bikeped.scene.conditions import LIGHTS, WEATHERS, Conditions, random_conditions
+from bikeped.scene.dataset import pictures, write_dataset
 from bikeped.scene.painter import KINDS, DrawnObject, ScenePainter
 
 __all__ = [
@@ -18,13 +20,20 @@ __all__ = [
     "KINDS",
     "LIGHTS",
     "WEATHERS",
+    "ClipTruth",
     "Conditions",
     "DrawnObject",
     "SceneCamera",
     "ScenePainter",
     "lens_camera",
+    "pictures",
+    "random_camera",
     "random_conditions",
     "random_scenario",
+    "read_sidecar",
     "rectilinear_camera",
     "scene_camera",
+    "sidecar_path",
+    "write_clip",
+    "write_dataset",
 ]

@@ -12,7 +12,7 @@ from bikeped.scene.camera import Rays, SceneCamera, rays
 from bikeped.scene.conditions import Conditions, Lighting, lighting
 from bikeped.scene.furniture import LAMP_HEAD_M, fixture, house
 from bikeped.scene.ground import GroundMap, ground_map, noise_tile
-from bikeped.scene.mesh import Mesh
+from bikeped.scene.mesh import Mesh, normals
 from bikeped.scene.place import Fixture, Place, place
 from bikeped.scene.sprite import Sprite, rasterise, shaded
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
@@ -88,7 +88,11 @@ def _backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
 
 def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
     """Sky colours [h, w, 3]: paler and hazier toward the horizon, with a flat layer of clouds."""
-    up = np.clip(ray.world[..., 2], 0, 1)
+    width, height = ray.lit.shape[1], ray.lit.shape[0]
+    world = np.asarray(
+        cv2.resize(ray.world, (width // 2, height // 2), interpolation=cv2.INTER_LINEAR), np.float32
+    )  # the sky is smooth
+    up = np.clip(world[..., 2], 0, 1)
     part = ((1 - up) ** 3)[..., None]
     out = light.sky_top.astype(np.float32) * (1 - part) + light.sky_low.astype(np.float32) * part
     spread = 1 / (up + 0.12)
@@ -97,8 +101,8 @@ def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
     cloud = np.asarray(
         cv2.remap(
             tile,
-            (ray.world[..., 0] * spread * 60 + shift) % 512,
-            (ray.world[..., 1] * spread * 60) % 512,
+            (world[..., 0] * spread * 60 + shift) % 512,
+            (world[..., 1] * spread * 60) % 512,
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_WRAP,
         )
@@ -109,12 +113,12 @@ def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
     )
     out += cover[..., None] * (white.astype(np.float32) - out)
     if light.sun.any():
-        toward = np.clip(ray.world @ light.to_sun.astype(np.float32), 0, 1)
-        glow = toward**60 * 0.5 + toward**900
-        out += (glow * (140 + 160 * light.glare))[..., None] * np.array(
-            [1.0, 0.95, 0.8], np.float32
-        )
-    return np.asarray(out, np.float32)
+        toward = np.clip(world @ light.to_sun.astype(np.float32), 0, 1)
+        near = toward > 0.9
+        glow = toward[near] ** 60 * 0.5 + toward[near] ** 900
+        warm = np.array([1.0, 0.95, 0.8], np.float32)
+        out[near] += (glow * (140 + 160 * light.glare))[:, None] * warm
+    return np.asarray(cv2.resize(out, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _ground(
@@ -213,7 +217,7 @@ def _lamp_pools(where: Place, xy: Float32Array) -> Float32Array:
 def _draw_far(image: ImageArray, mesh: Mesh, view: SceneCamera, light: Lighting) -> None:
     """Draws a solid of the background straight into the picture, its edges smoothed."""
     quads = mesh.quads
-    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    normal = normals(quads)
     middle = quads.mean(axis=1)
     facing = np.flatnonzero(((view.eye_m - middle) * normal).sum(1) > 0)
     if len(facing) == 0:

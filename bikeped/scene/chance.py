@@ -7,7 +7,9 @@ import math
 import numpy as np
 
 from bikeped.conformance.scenario import SIZES_M, Agent, Scenario
-from bikeped.scene.camera import DEFAULT_POSE
+from bikeped.errors import GeometryError
+from bikeped.geometry import CameraPose, Lens
+from bikeped.scene.camera import DEFAULT_POSE, SceneCamera, lens_camera, rectilinear_camera
 
 _DURATION_S = 6.0
 _NEAREST_M, _FARTHEST_M = 1.5, 40.0
@@ -90,3 +92,38 @@ def _heading(rng: np.random.Generator, kind: str) -> float:
     if kind in {"car", "bus", "truck"} and rng.random() < 0.8:
         return float(rng.choice([0.0, math.pi])) + float(rng.normal(0, 0.05))
     return float(rng.uniform(-math.pi, math.pi))
+
+
+def random_camera(
+    seed: int, size: tuple[int, int] = (960, 540), lens: str = "fisheye"
+) -> SceneCamera:
+    """A camera for training at the usual place: its lens, height and pitch vary.
+
+    `lens`: `fisheye` (field of view 150 to 205 degrees, four projections, the circle cut off above
+    and below as on the usual sensor) or `rectilinear` (55 to 100 degrees wide).
+    """
+    rng = np.random.default_rng((seed, 67))
+    height_m = float(rng.uniform(2.6, 5.5))
+    pose = CameraPose(
+        DEFAULT_POSE.x_m,
+        DEFAULT_POSE.y_m,
+        DEFAULT_POSE.heading_deg + float(rng.uniform(-12, 12)),
+    )
+    if lens == "rectilinear":
+        return rectilinear_camera(
+            float(rng.uniform(55, 100)),
+            size,
+            height_m=height_m,
+            pitch_deg=float(rng.uniform(-24, -6)),
+            pose=pose,
+        )
+    if lens != "fisheye":
+        raise GeometryError(f"lens: {lens!r} is not fisheye or rectilinear")
+    fov = float(rng.uniform(150, 205))
+    names = ["equidistant", "equisolid", "stereographic"] + ["orthographic"] * (fov < 178)
+    circle = size[0] * float(rng.uniform(0.42, 0.52))
+    name = str(rng.choice(names))
+    model = Lens.from_circle(name, circle, min(fov, 176.0) if name == "orthographic" else fov)
+    return lens_camera(
+        model, size, height_m=height_m, pitch_deg=float(rng.uniform(-25, 4)), pose=pose
+    )

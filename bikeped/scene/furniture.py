@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bikeped.conformance.scenario import SIZES_M
-from bikeped.scene.mesh import Builder, Mesh, Rgb
+from bikeped.scene.mesh import Builder, Mesh, Point, Rgb
 from bikeped.scene.place import Fixture, House
 from bikeped.scene.vehicles import vehicle
 
@@ -119,7 +119,17 @@ def _tree(rng: np.random.Generator) -> Mesh:
 def house(item: House, lit_windows: bool) -> Mesh:
     """A house: front and ends in cells of one window each."""
     rng = np.random.default_rng(item.number)
-    b = Builder()
+    quads: list[list[Point]] = []
+    colours: list[Rgb] = []
+    glows: list[float] = []
+    layers: list[int] = []
+
+    def add(face: list[Point], colour: Rgb, glow: float = 0.0, layer: int = 0) -> None:
+        quads.append(face)
+        colours.append(colour)
+        glows.append(glow)
+        layers.append(layer)
+
     floors = max(int((item.height - 0.8) / 3.0), 1)
     columns = max(int((item.x1 - item.x0) / 2.6), 1)
     pitch, storey = (item.x1 - item.x0) / columns, item.height / floors
@@ -138,7 +148,7 @@ def house(item: House, lit_windows: bool) -> Mesh:
             (x1, y + out * layer, z1),
             (x0, y + out * layer, z1),
         ]
-        b.faces([face if north else face[::-1]], colour, glow, layer)
+        add(face if north else face[::-1], colour, glow, layer)
 
     for floor in range(floors):
         z = floor * storey
@@ -187,7 +197,7 @@ def house(item: House, lit_windows: bool) -> Mesh:
             z0, z1 = floor * storey, (floor + 1) * storey
             for y0, y1 in zip(ys, ys[1:], strict=False):
                 face = [(x, y1, z0), (x, y0, z0), (x, y0, z1), (x, y1, z1)]
-                b.faces([face[::order]], tuple(c * 0.9 for c in item.wall))
+                add(face[::order], tuple(c * 0.9 for c in item.wall))  # type: ignore[arg-type]
                 if (item.number >> floor) % 2:
                     p, q = y0 + 0.3 * (y1 - y0), y0 + 0.7 * (y1 - y0)
                     e = -0.02 * order
@@ -197,5 +207,10 @@ def house(item: House, lit_windows: bool) -> Mesh:
                         (x + e, p, z1 - 0.7),
                         (x + e, q, z1 - 0.7),
                     ]
-                    b.faces([pane_quad[::order]], (74, 88, 102), layer=2)
-    return b.build()
+                    add(pane_quad[::order], (74, 88, 102), layer=2)
+    return Mesh(
+        np.array(quads, np.float64),
+        np.array(colours, np.float64),
+        np.array(glows),
+        np.array(layers, np.int8),
+    )

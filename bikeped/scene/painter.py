@@ -95,6 +95,7 @@ class ScenePainter:
             for agent in scenario.agents
         }
         self._base = self._with_fixtures()
+        self._mask = cv2.merge([self.backdrop.lit.astype(np.uint8) * 255] * 3)
         self._last: tuple[float, ImageArray, list[DrawnObject]] | None = None
 
     def frame(self, t_s: float) -> ImageArray:
@@ -126,7 +127,7 @@ class ScenePainter:
                 if mesh is not None:
                     self._shine(image, mesh, item)
         self._weather.apply(image, t_s)
-        image[~self.backdrop.lit] = 0
+        cv2.bitwise_and(image, self._mask, dst=image)
         objects = self._labels(shown)
         self._last = (t_s, image, objects)
         return image.copy(), list(objects)
@@ -143,7 +144,7 @@ class ScenePainter:
                 continue
             xy, heading = state
             away = float(np.hypot(*(xy - eye)))
-            mesh = self._mesh(agent, t).placed(xy, heading)
+            mesh = self._mesh(agent, t, away).placed(xy, heading)
             sprite = rasterise(
                 mesh,
                 self.camera,
@@ -168,14 +169,17 @@ class ScenePainter:
         found.sort(key=lambda pair: -pair[0].sprite.away_m)
         return found
 
-    def _mesh(self, agent: Agent, t: float) -> Mesh:
+    def _mesh(self, agent: Agent, t: float, away_m: float) -> Mesh:
         looks = self._looks[agent.id]
+        # Far figures need no round limbs.
+        tall_px = agent.size_m[2] * self.camera.focal_px / max(away_m, 1.0)
+        sides = 5 if tall_px < 90 else 8
         way, moving = _travelled(agent, t)
         number = (self.conditions.seed * 31 + agent.id * 7) % 1000
         if agent.kind == "pedestrian":
-            return person(agent.size_m, looks, way, moving)
+            return person(agent.size_m, looks, way, moving, sides)
         if agent.kind in {"cyclist", "motorcycle"}:
-            return rider(agent.kind, agent.size_m, looks, number, way)
+            return rider(agent.kind, agent.size_m, looks, number, way, sides)
         return vehicle(agent.kind, agent.size_m, number)
 
     # -- pixels -----------------------------------------------------------------------------

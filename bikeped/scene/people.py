@@ -79,20 +79,25 @@ class Looks:
         )
 
 
-def person(size_m: tuple[float, float, float], looks: Looks, way_m: float, moving: bool) -> Mesh:
-    """A pedestrian agent's mesh in its own axes: a wheelchair user, a child or a grown walker."""
+def person(
+    size_m: tuple[float, float, float], looks: Looks, way_m: float, moving: bool, sides: int = 8
+) -> Mesh:
+    """A pedestrian agent's mesh in its own axes: a wheelchair user, a child or a grown walker.
+
+    `way_m`: what they have covered, which poses their legs; `sides`: how round limbs are.
+    """
     if size_m[0] >= WHEELCHAIR_MIN_LENGTH_M:
-        return _wheelchair(size_m, looks, way_m)
-    return walker(size_m[2], looks, way_m, moving)
+        return _wheelchair(size_m, looks, way_m, sides)
+    return walker(size_m[2], looks, way_m, moving, sides)
 
 
-def walker(height_m: float, looks: Looks, way_m: float, moving: bool) -> Mesh:
+def walker(height_m: float, looks: Looks, way_m: float, moving: bool, sides: int = 8) -> Mesh:
     """Somebody on foot; the lower shoe stands on the ground."""
     s = height_m / 1.7
     child = height_m < CHILD_MAX_HEIGHT_M
     phase = 2 * math.pi * (way_m / (_STRIDE_M * s) + looks.pace)
     swing = 0.33 if moving else 0.05
-    b = Builder()
+    b = Builder(sides)
     g = looks.girth
     legs = []
     low = math.inf
@@ -200,9 +205,9 @@ def head(b: Builder, neck: Point, s: float, looks: Looks) -> None:
     _head(b, neck, s, looks, helmet=True)
 
 
-def _wheelchair(size_m: tuple[float, float, float], looks: Looks, way_m: float) -> Mesh:
+def _wheelchair(size_m: tuple[float, float, float], looks: Looks, way_m: float, sides: int) -> Mesh:
     """A wheelchair and who sits in it, 1.1 x 0.65 x 1.3 m, stretched to `size_m`."""
-    b = Builder()
+    b = Builder(sides)
     frame: Rgb = (54, 58, 66) if looks.girth < 1 else (120, 40, 44)
     turned = way_m / 0.3
     for side in (1.0, -1.0):

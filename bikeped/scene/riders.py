@@ -19,18 +19,25 @@ _TAIL: Rgb = (230, 30, 26)
 
 
 def rider(
-    kind: str, size_m: tuple[float, float, float], looks: Looks, paint: int, way_m: float
+    kind: str,
+    size_m: tuple[float, float, float],
+    looks: Looks,
+    paint: int,
+    way_m: float,
+    sides: int = 8,
 ) -> Mesh:
     """A cyclist or motorcycle agent's mesh in its own axes."""
     if kind == "motorcycle":
-        return _motorcycle(size_m, looks, paint, way_m)
+        return _motorcycle(size_m, looks, paint, way_m, sides)
     if size_m[0] < SCOOTER_MAX_LENGTH_M:
-        return _scooter(size_m, looks, paint)
-    return _bicycle(size_m, looks, paint, way_m)
+        return _scooter(size_m, looks, paint, sides)
+    return _bicycle(size_m, looks, paint, way_m, sides)
 
 
-def _bicycle(size_m: tuple[float, float, float], looks: Looks, paint: int, way_m: float) -> Mesh:
-    b = Builder()
+def _bicycle(
+    size_m: tuple[float, float, float], looks: Looks, paint: int, way_m: float, sides: int
+) -> Mesh:
+    b = Builder(sides)
     frame = PAINTS[paint % len(PAINTS)]
     sporty = paint % 3 == 0  # bent low over the bars, or upright
     roll = way_m / _WHEEL_M
@@ -140,9 +147,9 @@ def _knee(
     return hip[0] + thigh * math.cos(angle), hip[1] + thigh * math.sin(angle)
 
 
-def _scooter(size_m: tuple[float, float, float], looks: Looks, paint: int) -> Mesh:
+def _scooter(size_m: tuple[float, float, float], looks: Looks, paint: int, sides: int) -> Mesh:
     """Somebody standing on an e-scooter, 1.2 x 0.5 x 1.75 m."""
-    b = Builder()
+    b = Builder(sides)
     frame = PAINTS[(paint + 2) % len(PAINTS)]
     for x in (-0.47, 0.47):
         b.wheel((x, 0, 0.115), 0.115, 0.03, RUBBER, steps=14)
@@ -178,8 +185,10 @@ def _scooter(size_m: tuple[float, float, float], looks: Looks, paint: int) -> Me
     return b.build().placed((0, 0), 0.0, (size_m[0] / 1.2, size_m[1] / 0.52, size_m[2] / 1.82))
 
 
-def _motorcycle(size_m: tuple[float, float, float], looks: Looks, paint: int, way_m: float) -> Mesh:
-    b = Builder()
+def _motorcycle(
+    size_m: tuple[float, float, float], looks: Looks, paint: int, way_m: float, sides: int
+) -> Mesh:
+    b = Builder(sides)
     colour = PAINTS[(paint + 1) % len(PAINTS)]
     for x in (-0.72, 0.74):
         b.wheel((x, 0, 0.31), 0.31, 0.07, RUBBER, spokes=5, turned=-way_m / 0.31)

@@ -10,7 +10,7 @@ import numpy as np
 
 from bikeped.scene.camera import SceneCamera
 from bikeped.scene.conditions import Lighting
-from bikeped.scene.mesh import Mesh
+from bikeped.scene.mesh import Mesh, normals
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
 
 _SHIFT = 5
@@ -56,23 +56,25 @@ def rasterise(
     """
     eye = view.eye_m
     quads = mesh.quads
-    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
-    middle = quads.mean(axis=1)
-    facing = ((eye - middle) * normal).sum(1) > 0
+    normal = normals(quads)
+    facing = np.einsum("ij,ij->i", eye - quads[:, 0], normal) > 0
     if not facing.any():
         return None
     pixels = view.pixels(quads[facing].reshape(-1, 3)).reshape(-1, 4, 2)
-    whole = np.isfinite(pixels).all(axis=(1, 2))
-    if not whole.any():
+    kept = np.flatnonzero(facing)
+    whole = _whole(pixels)
+    if not whole.all():
+        kept, pixels = kept[whole], pixels[whole]
+    if len(kept) == 0:
         return None
-    kept = np.flatnonzero(facing)[whole]
-    pixels = pixels[whole]
-    low, high = pixels.min(axis=(0, 1)), pixels.max(axis=(0, 1))
+    low, high = _extent(pixels)
     bounds = _bounds(low, high, view.size)
     if bounds is None:
         return None
     left, top, right, bottom = bounds
-    away = np.linalg.norm(middle[kept] - eye, axis=1)
+    part = quads[kept]
+    sight = 0.25 * (part[:, 0] + part[:, 1] + part[:, 2] + part[:, 3]) - eye
+    away = np.einsum("ij,ij->i", sight, sight)
     order = np.lexsort((-away, mesh.layer[kept]))
     colour = shaded(mesh, normal, kept, light, local)[order]
     scale = _supersampling(float((high - low).max()))
@@ -117,7 +119,7 @@ def shadow(
     quads: FloatArray, view: SceneCamera, to_sun: FloatArray, softness: float
 ) -> tuple[int, int, Float32Array] | None:
     """Where faces [n, 4, 3] keep the sun off the ground: left, top and coverage [h, w] 0..1."""
-    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    normal = normals(quads)
     lit = quads[(normal @ to_sun) > 0]
     if len(lit) == 0:
         return None
@@ -126,10 +128,10 @@ def shadow(
     flat[..., :2] -= lit[..., 2:] * slope
     flat[..., 2] = 0
     pixels = view.pixels(flat.reshape(-1, 3)).reshape(-1, 4, 2)
-    pixels = pixels[np.isfinite(pixels).all(axis=(1, 2))]
+    pixels = pixels[_whole(pixels)]
     if len(pixels) == 0:
         return None
-    bounds = _bounds(pixels.min(axis=(0, 1)), pixels.max(axis=(0, 1)), view.size, beyond=0.0)
+    bounds = _bounds(*_extent(pixels), view.size, beyond=0.0)
     if bounds is None:
         return None
     left, top, right, bottom = bounds
@@ -172,9 +174,15 @@ def inside(
     )
 
 
-def covered(alpha: ImageArray) -> BoolArray:
-    """Which pixels are at least half covered."""
-    return np.asarray(alpha >= 128)
+def _whole(pixels: FloatArray) -> BoolArray:
+    """Which faces [n, 4, 2] have all their corners."""
+    flat = pixels.reshape(-1, 8)
+    return np.isfinite(flat @ np.ones(8))
+
+
+def _extent(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    u, v = pixels[..., 0], pixels[..., 1]
+    return np.array([u.min(), v.min()]), np.array([u.max(), v.max()])
 
 
 def _bounds(

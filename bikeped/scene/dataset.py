@@ -1,0 +1,145 @@
+"""Sets of drawn pictures in COCO's format, for training and evaluation."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bikeped.errors import BikepedError
+from bikeped.files import make_folder
+from bikeped.scene.camera import SceneCamera
+from bikeped.scene.chance import random_camera, random_scenario
+from bikeped.scene.clip import encode_jpeg
+from bikeped.scene.conditions import Conditions, random_conditions
+from bikeped.scene.painter import DrawnObject, ScenePainter
+from bikeped.types import ImageArray, Kind
+
+CATEGORIES = [{"id": kind.value + 1, "name": kind.label} for kind in Kind]
+#: Less than this share of somebody to be seen, or a box smaller than this, is no annotation to
+#: learn from or to be judged by: it is kept and marked as a crowd, which COCO's measures ignore.
+MIN_VISIBLE = 0.3
+MIN_SIDE_PX = 5.0
+_PER_STREET = 4  #: pictures that share a street, which costs more than who is on it
+
+
+def pictures(
+    count: int,
+    seed: int,
+    camera: SceneCamera | None = None,
+    *,
+    size: tuple[int, int] = (960, 540),
+    lens: str = "fisheye",
+) -> Iterator[tuple[ImageArray, list[DrawnObject], Conditions, SceneCamera]]:
+    """`count` drawn pictures with their objects: random scenarios, lights, weathers and places.
+
+    `camera`: for all of them; None draws a camera for every street (`lens`: fisheye or
+    rectilinear). Equal arguments give equal pictures; a larger `count` begins with the same ones.
+    """
+    conditions, view = Conditions(), camera
+    for number in range(count):
+        street = seed * 1_000_003 + number // _PER_STREET
+        if number % _PER_STREET == 0:
+            conditions = random_conditions(street)
+            view = camera or random_camera(street, size, lens)
+        assert view is not None
+        rng = np.random.default_rng((seed, number, 59))
+        painter = ScenePainter(random_scenario(seed * 1_000_003 + number), view, conditions)
+        image, objects = painter.draw(float(rng.uniform(0.2, 5.8)))
+        yield image, objects, conditions, view
+
+
+def write_dataset(
+    folder: Path,
+    count: int,
+    seed: int = 0,
+    camera: SceneCamera | None = None,
+    *,
+    size: tuple[int, int] = (960, 540),
+    lens: str = "fisheye",
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Writes `folder`/images/*.jpg and `folder`/annotations.json; returns the latter.
+
+    The folder appears whole or not at all, so it must not be there yet (or be empty). Annotations
+    carry `visible` (share), `distance_m`, `kind` and `ignore` beside COCO's keys; hardly visible or
+    tiny ones have `iscrowd` 1. Raises BikepedError when the folder is taken or not writable.
+    """
+    if not 1 <= count <= 1_000_000:
+        raise BikepedError(f"count: {count} is not 1 to 1000000 pictures")
+    if seed < 0:
+        raise BikepedError(f"seed: {seed} must not be negative")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise BikepedError(f"{folder}: is there already; choose another folder or remove it")
+    make_folder(folder.parent)
+    try:
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise BikepedError(
+            f"{folder}: cannot be made ({error.strerror}); choose another folder"
+        ) from error
+    try:
+        (partial / "images").mkdir()
+        images: list[dict[str, Any]] = []
+        notes: list[dict[str, Any]] = []
+        drawn = pictures(count, seed, camera, size=size, lens=lens)
+        for number, (image, objects, conditions, _) in enumerate(drawn):
+            name = f"{number:06d}.jpg"
+            quality = 78 + (seed * 7 + number * 5) % 18
+            (partial / "images" / name).write_bytes(encode_jpeg(image, quality))
+            images.append(
+                {
+                    "id": number + 1,
+                    "file_name": name,
+                    "width": image.shape[1],
+                    "height": image.shape[0],
+                    "conditions": asdict(conditions),
+                }
+            )
+            notes += [_annotation(len(notes) + i + 1, number + 1, o) for i, o in enumerate(objects)]
+            if progress is not None:
+                progress(number + 1, count)
+        data = {
+            "info": {"description": "drawn by bikeped", "seed": seed, "lens": lens},
+            "images": images,
+            "annotations": notes,
+            "categories": CATEGORIES,
+        }
+        (partial / "annotations.json").write_text(json.dumps(data) + "\n", encoding="utf-8")
+        partial.chmod(0o755)
+        if folder.exists():
+            folder.rmdir()
+        os.replace(partial, folder)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise BikepedError(
+            f"{folder}: cannot be written ({error.strerror}); check the free disk space"
+        ) from error
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return folder / "annotations.json"
+
+
+def _annotation(number: int, image: int, item: DrawnObject) -> dict[str, Any]:
+    u1, v1, u2, v2 = item.box_px
+    hard = item.visible < MIN_VISIBLE or min(u2 - u1, v2 - v1) < MIN_SIDE_PX
+    return {
+        "id": number,
+        "image_id": image,
+        "category_id": item.label.value + 1,
+        "bbox": [round(u1, 2), round(v1, 2), round(u2 - u1, 2), round(v2 - v1, 2)],
+        "area": round((u2 - u1) * (v2 - v1), 2),
+        "iscrowd": int(hard),
+        "ignore": int(hard),
+        "visible": round(item.visible, 4),
+        "distance_m": round(item.distance_m, 3),
+        "kind": item.kind,
+    }
