@@ -10,8 +10,6 @@ from rich.table import Table
 from bikeped.cli.common import console, json_option, progress_bar, write_json
 from bikeped.cli.guard import check_outputs, guarded
 
-_DEFAULT = "  Default: {}."
-
 
 @click.command("augment")
 @click.argument("data", type=click.Path(path_type=Path))

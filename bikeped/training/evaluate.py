@@ -29,6 +29,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from bikeped import __version__
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.layouts import Candidates
@@ -99,6 +100,7 @@ class Evaluation:
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
+            "version": __version__,
             "data": self.data,
             "settings": self.settings,
             "models": [

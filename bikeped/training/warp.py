@@ -134,11 +134,6 @@ class Warp:
         inside = ((xy >= 0) & (xy <= np.asarray(picture_wh, np.float64))).all(axis=-1)
         return xy, ahead & inside
 
-    def in_circle(self, uv_px: FloatArray) -> BoolArray:
-        """Which points [..., 2] lie inside the image circle."""
-        away = np.hypot(uv_px[..., 0] - self.centre_px[0], uv_px[..., 1] - self.centre_px[1])
-        return np.asarray(away <= self.lens.max_radius_px)
-
     def as_dict(self) -> dict[str, Any]:
         """For the record that an augmented picture carries."""
         return {
@@ -199,14 +194,14 @@ def warp_picture(image: ImageArray, warp: Warp) -> ImageArray:
     high, wide = image.shape[:2]
     size = warp.size_px
     axis = np.arange(size) + 0.5
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1)
-    out: ImageArray = (
-        np.where(warp.in_circle(grid)[..., None], FILL, 0).astype(np.uint8).repeat(3, axis=2)
-    )
+    across, down = ((axis - middle) ** 2 for middle in warp.centre_px)
+    circle = across[None, :] + down[:, None] <= warp.lens.max_radius_px**2
+    out: ImageArray = np.zeros((size, size, 3), np.uint8)
+    out[circle] = FILL
     left, top, right, low = _picture_window(warp, (wide, high))
     if right <= left or low <= top:
         return out
-    window = grid[top:low, left:right]
+    window = np.stack(np.meshgrid(axis[left:right], axis[top:low]), axis=-1)
     xy, inside = warp.inverse(window, (wide, high))
     if not inside.any():
         return out

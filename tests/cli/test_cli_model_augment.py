@@ -76,3 +76,22 @@ def test_bad_input_is_one_line_and_status_2(file, tmp_path, monkeypatch, capsys,
     assert error.count("\n") == 1
     assert message in error
     assert not (tmp_path / "o").exists()
+
+
+def test_the_help_tells_the_defaults_of_the_code():
+    from bikeped.cli.model_augment import command
+    from bikeped.training.augment import AugmentSettings
+    from bikeped.training.warp import WarpRanges
+
+    ranges = WarpRanges()
+    told = {option.name: option for option in command.params}
+    for name, value in ranges.as_dict().items():
+        if name == "projections":
+            assert told[name].type.choices == list(value) or tuple(told[name].type.choices) == value
+        elif name == "size_px":
+            assert told[name].default == value
+        else:
+            least, most = value
+            assert told[name].help.endswith(f"Default: {least:g} {most:g}.")
+    assert told["least_share"].default == AugmentSettings().least_share
+    assert told["processes"].default == AugmentSettings().processes

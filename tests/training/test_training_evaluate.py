@@ -223,6 +223,14 @@ def test_a_real_network_over_real_pictures(tmp_path):
     edit(folder / "annotations.json", images=images, annotations=things, categories=CATEGORIES)
     result = evaluate(read_coco(folder), load_models([("nano", MODEL)], CPU), CPU, ONE)
     (score,) = result.scores
+    # What is measured as deployed is what the deployed call answers.
+    (nano,) = load_models([("nano", MODEL)], CPU)
+    frame = cv2.cvtColor(cv2.imread(str(folder / "390.png")), cv2.COLOR_BGR2RGB)
+    deployed = nano.detector.infer(frame, 768, 432).detections
+    users, every = nano.detector.infer_classes(frame, 768, 432, 0.001)
+    assert len(every) > len(users) > 0
+    for part in ("kind", "confidence", "box_px"):
+        assert np.array_equal(getattr(users, part), getattr(deployed, part))
     assert (score.facts["classes_in_model"], score.facts["input_px"]) == (80, [416, 416])
     car = rows(score.classes)["car"]
     assert (car.objects, car.ap50) == (2, pytest.approx(1))
