@@ -23,7 +23,8 @@ from bikeped.types import FloatArray
 Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic", "perspective"]
 
 _ALIASES = {"linear": "equidistant", "equalarea": "equisolid"}
-_LIMITS: dict[str, float] = {
+#: The angle from the axis at which each projection ends, radians.
+LIMITS: dict[str, float] = {
     "equidistant": math.pi,
     "equisolid": math.pi,
     # Short of the pole at infinity, so that r stays finite.
@@ -40,9 +41,9 @@ def canonical_projection(name: str) -> Projection:
     Raises GeometryError for a name that is none of them.
     """
     proper = _ALIASES.get(name, name)
-    if proper not in _LIMITS:
+    if proper not in LIMITS:
         raise GeometryError(
-            f"projection: unknown model {name!r}; use one of {', '.join(sorted(_LIMITS))}"
+            f"projection: unknown model {name!r}; use one of {', '.join(sorted(LIMITS))}"
         )
     return cast(Projection, proper)
 
@@ -108,7 +109,7 @@ class Lens:
                 f"focal length: {self.focal_px} px is not a positive number; check radius_px, "
                 "fov_deg and the calibration's focal_length"
             )
-        limit = _LIMITS[self.projection]
+        limit = LIMITS[self.projection]
         if not 0 < self.max_theta_rad <= limit + 1e-9:
             raise GeometryError(
                 f"fov_deg: {math.degrees(2 * self.max_theta_rad):.1f} is outside what a "
@@ -139,7 +140,7 @@ class Lens:
         """
         proper = canonical_projection(projection)
         half = math.radians(fov_deg) / 2
-        unit = float(curve(proper, np.asarray([min(half, _LIMITS[proper])], dtype=np.float64))[0])
+        unit = float(curve(proper, np.asarray([min(half, LIMITS[proper])], dtype=np.float64))[0])
         if unit <= 0:
             raise GeometryError(f"fov_deg: {fov_deg} gives no focal length; use a positive angle")
         return Lens(proper, radius_px / unit, half, k)

@@ -1,0 +1,70 @@
+"""Cross-validation: how well the lens predicts pictures that did not help to fit it.
+
+The pictures are dealt into folds. Lens and board shape are fitted on all folds but one; on the one
+held out only the poses are fitted, with lens and shape as they are; what is left there is counted.
+A model that bends to the noise of its own pictures is found out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bikeped.calibration.adjust import Adjusted, readjust
+from bikeped.calibration.jacobian import jacobian
+from bikeped.calibration.model import Sightings, State, residuals, rotations
+from bikeped.types import FloatArray, IntArray
+
+
+def folds_of(pictures: int, folds: int) -> IntArray:
+    """[pictures] the fold of each: dealt in turn, so that neighbours in time are split."""
+    return np.arange(pictures) % min(folds, pictures)
+
+
+def held_out_residuals(fitted: Adjusted, sightings: Sightings, folds: int) -> FloatArray:
+    """[V, C, 2] residuals of each picture under the lens that the other folds give, pixels."""
+    fold = folds_of(len(sightings), folds)
+    left = np.zeros_like(fitted.residuals_px)
+    for number in range(fold.max() + 1):
+        out = fold == number
+        near = replace(fitted, state=fitted.state.rows(~out))
+        train = readjust(sightings.rows(~out), near)
+        held = sightings.rows(out)
+        state = replace(train, turn=fitted.state.turn[out], move=fitted.state.move[out])
+        left[out] = residuals(fit_poses(state, held), held)
+    return left
+
+
+def fit_poses(start: State, sightings: Sightings, steps: int = 20) -> State:
+    """The poses that fit best under the lens and shape of `start`, each picture by itself."""
+    state = start
+    error = residuals(state, sightings)
+    cost: FloatArray = np.asarray((error * error).sum((1, 2)))
+    damping: FloatArray = np.full(len(cost), 1e-4)
+    index = np.arange(6)
+    for _ in range(steps):
+        jac = jacobian(state, sightings.flat).pose * sightings.seen[..., None, None]
+        tall = jac.reshape(len(cost), -1, 6)
+        normal = tall.transpose(0, 2, 1) @ tall
+        slope = (tall.transpose(0, 2, 1) @ error.reshape(len(cost), -1, 1))[..., 0]
+        normal[:, index, index] *= 1 + damping[:, None]
+        step: FloatArray = np.asarray(-np.linalg.solve(normal, slope[..., None])[..., 0])
+        trial = replace(
+            state, turn=rotations(step[:, :3]) @ state.turn, move=state.move + step[:, 3:]
+        )
+        trial_error = residuals(trial, sightings)
+        trial_cost = (trial_error * trial_error).sum((1, 2))
+        better = trial_cost <= cost
+        gained = np.where(better, cost - trial_cost, 0.0)
+        state = replace(
+            state,
+            turn=np.where(better[:, None, None], trial.turn, state.turn),
+            move=np.where(better[:, None], trial.move, state.move),
+        )
+        error = np.where(better[:, None, None], trial_error, error)
+        cost = np.asarray(np.where(better, trial_cost, cost))
+        damping = np.asarray(np.where(better, damping / 10, damping * 10))
+        if (gained <= 1e-9 * cost + 1e-18).all() and better.all():
+            break
+    return state
