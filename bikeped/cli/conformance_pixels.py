@@ -1,0 +1,103 @@
+"""`bikeped conformance pixels`: the suite drawn and run through the deployed loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from bikeped.cli.common import console, progress_bar
+from bikeped.cli.conformance_shared import begin, cores, emit, processes_option, suite_options
+from bikeped.cli.guard import guarded
+from bikeped.errors import BikepedError
+from bikeped.files import make_folder
+
+
+def _size(text: str) -> tuple[int, int]:
+    parts = text.lower().split("x")
+    if len(parts) == 2 and all(p.isdigit() for p in parts):
+        width, height = (int(p) for p in parts)
+        if 160 <= width <= 7680 and 90 <= height <= 4320:
+            return width, height
+    raise BikepedError(f"--size {text}: give width x height in pixels, e.g. 1920x1080")
+
+
+@click.command("pixels")
+@suite_options
+@click.option("--scenario", "names", multiple=True, metavar="NAME", help="Only this one; repeat.")
+@click.option("--size", default="1920x1080", show_default=True, help="Of the pictures.")
+@click.option(
+    "--light",
+    type=click.Choice(["day", "overcast", "dusk", "night", "glare"]),
+    default="day",
+    show_default=True,
+)
+@click.option("--weather", type=click.Choice(["dry", "rain"]), default="dry", show_default=True)
+@click.option("--place", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
+@click.option(
+    "--figures",
+    "figures",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="Draw stages, recall and localisation error: pixels.png and pixels.pdf in this folder.",
+)
+@processes_option
+@guarded
+def command(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    seed: int | None,
+    json_path: str | None,
+    names: tuple[str, ...],
+    size: str,
+    light: str,
+    weather: str,
+    place: int,
+    figures: Path | None,
+    processes: int | None,
+) -> None:
+    """All scenarios drawn, detected, projected, tracked and decided by the deployed loop, against
+    the truth; what is lost against the scripted run is named by stage.
+
+    Without a configured detector the bundled one looks.
+    """
+    from dataclasses import replace
+
+    from bikeped.conformance.experiments import one_scenario
+    from bikeped.pixels.ladder import ladder
+    from bikeped.pixels.measures import sights
+    from bikeped.pixels.report import Drawing, pixels_result, verdict
+    from bikeped.pixels.run import run_all
+    from bikeped.scene import Conditions
+
+    width, height = _size(size)
+    if figures is not None:
+        from bikeped.conformance.figure_style import require_matplotlib
+
+        require_matplotlib()
+    # One thread each: the processes share the cores. A --set that is given comes later and wins.
+    overrides = ("detection.threads=1", *overrides)
+    loaded, suite = begin(config_path, overrides, scenarios_dir)
+    if loaded.config.detection.model is None:
+        loaded, suite = begin(config_path, ("detection.model=bundled", *overrides), scenarios_dir)
+    if names:
+        suite = replace(
+            suite, scenarios=tuple(s for n in names for s in one_scenario(suite, n).scenarios)
+        )
+    conditions = Conditions(seed=seed or 0, light=light, weather=weather, place=place)
+    with progress_bar("scenarios", len(suite.scenarios)) as progress:
+        runs = run_all(
+            loaded, suite.scenarios, conditions, (width, height), processes or cores(), progress
+        )
+    rungs = ladder(suite, runs, loaded, loaded.config.decision)
+    drawing = Drawing(width, height, light, weather, place, seed or 0)
+    result = pixels_result(suite, runs, rungs, sights(runs, suite.seen, loaded), drawing)
+    if figures is not None:
+        from bikeped.pixels.figure import draw_pixels
+
+        make_folder(figures)
+        draw_pixels(result.data, figures)
+    emit(result, suite, loaded, seed or 0, json_path)
+    if json_path != "-":
+        console(json_path).print(verdict(rungs))

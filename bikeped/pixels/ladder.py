@@ -1,0 +1,147 @@
+"""From the scripted run to the pixels, one stage at a time: which stage loses what.
+
+Each rung hands the deployed tracker and decision a little more of what the pixels do; what changes
+between two rungs is lost (or won) at that stage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.conformance.metrics import Metrics, measure
+from bikeped.conformance.perception import Seen
+from bikeped.conformance.simulate import FPS
+from bikeped.conformance.suite import Suite
+from bikeped.pixels.matching import MIN_VISIBLE, match
+from bikeped.pixels.run import PixelRun
+from bikeped.scene import DrawnObject
+from bikeped.service.judge import Judge
+from bikeped.types import Detections, GroundPoints
+
+States = npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One step: its name, what it adds to the one before, and the figures with it."""
+
+    name: str
+    adds: str
+    states: States
+    metrics: Metrics
+
+
+def ladder(
+    suite: Suite, runs: Sequence[PixelRun], loaded: LoadedConfig, decision: DecisionConfig
+) -> list[Rung]:
+    """The rungs from scripted positions to the deployed loop, over all scenarios of `suite`."""
+    judge = Judge(loaded)
+    seen = suite.seen
+
+    def points(present: Callable[[PixelRun, int, int], bool]) -> States:
+        return np.concatenate(
+            [_judge_points(judge, s, run, present) for s, run in zip(seen, runs, strict=True)]
+        )
+
+    def boxes(of: Callable[[PixelRun, int], Detections]) -> States:
+        return np.concatenate([_judge_boxes(judge, run, of) for run in runs])
+
+    steps: list[tuple[str, str, States]] = [
+        ("scripted", "positions with the box model's error", suite.states(decision)),
+        ("tracker", "the pole's tracker in place of the simulation's", points(_always)),
+        ("picture", "who stands outside the picture is not seen", points(_in_picture)),
+        ("outline", "boxes around what was drawn", boxes(_whole)),
+        ("occlusion", "hidden parts are not seen", boxes(_visible)),
+        ("misses", "only what the detector found", boxes(_found_exact)),
+        ("boxes", "the detector's boxes", boxes(_found_true_kind)),
+        ("kinds", "the detector's kinds", boxes(_found)),
+        (
+            "false detections",
+            "all that the detector said: the deployed loop",
+            np.concatenate([run.state for run in runs]),
+        ),
+    ]
+    return [
+        Rung(name, adds, states, measure(suite.truth_frames, states))
+        for name, adds, states in steps
+    ]
+
+
+def _judge_points(
+    judge: Judge, seen: Seen, run: PixelRun, present: Callable[[PixelRun, int, int], bool]
+) -> States:
+    judge.reset()
+    states = []
+    for frame in range(len(seen.present)):
+        index = np.asarray(
+            [
+                a
+                for a in np.nonzero(seen.present[frame])[0].tolist()
+                if present(run, frame, run.scenario.agents[a].id)
+            ],
+            np.int64,
+        )
+        points = GroundPoints(seen.kind[index], seen.observed_m[frame, index], index)
+        states.append(int(judge.judge_points(points, frame / FPS).decision.state))
+    return np.asarray(states, np.int8)
+
+
+def _judge_boxes(judge: Judge, run: PixelRun, of: Callable[[PixelRun, int], Detections]) -> States:
+    judge.reset()
+    return np.asarray(
+        [
+            int(judge.judge(of(run, f), run.width, run.height, f / FPS, 0.0).decision.state)
+            for f in range(len(run.state))
+        ],
+        np.int8,
+    )
+
+
+def _always(run: PixelRun, frame: int, agent: int) -> bool:
+    return True
+
+
+def _in_picture(run: PixelRun, frame: int, agent: int) -> bool:
+    return any(o.id == agent for o in run.objects[frame])
+
+
+def _exact(objects: Sequence[DrawnObject], whole: bool) -> Detections:
+    if not objects:
+        return Detections.empty()
+    return Detections(
+        np.asarray([int(o.label) for o in objects], np.int8),
+        np.ones(len(objects), np.float32),
+        np.asarray([o.full_box_px if whole else o.box_px for o in objects], np.float32),
+    )
+
+
+def _whole(run: PixelRun, frame: int) -> Detections:
+    return _exact(run.objects[frame], whole=True)
+
+
+def _visible(run: PixelRun, frame: int) -> Detections:
+    return _exact([o for o in run.objects[frame] if o.visible >= MIN_VISIBLE], whole=False)
+
+
+def _found_exact(run: PixelRun, frame: int) -> Detections:
+    objects = run.objects[frame]
+    found = match(run.detections[frame], objects).found
+    return _exact([o for o, d in zip(objects, found, strict=True) if d >= 0], whole=False)
+
+
+def _found(run: PixelRun, frame: int) -> Detections:
+    detections = run.detections[frame]
+    return detections.take(match(detections, run.objects[frame]).object >= 0)
+
+
+def _found_true_kind(run: PixelRun, frame: int) -> Detections:
+    detections, objects = run.detections[frame], run.objects[frame]
+    which = match(detections, objects).object
+    kept = detections.take(which >= 0)
+    kind = np.asarray([int(objects[o].label) for o in which[which >= 0]], np.int8)
+    return Detections(kind, kept.confidence, kept.box_px)

@@ -1,0 +1,195 @@
+"""Pixel conformance as data, tables and a figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from bikeped.conformance.experiments import SHOWN_COLUMNS, percent, shown
+from bikeped.conformance.metrics import Metrics, number
+from bikeped.conformance.perception import error_table
+from bikeped.conformance.suite import Suite
+from bikeped.conformance.tables import Cell, Result, Table
+from bikeped.pixels.ladder import Rung
+from bikeped.pixels.matching import MIN_IOU, MIN_VISIBLE
+from bikeped.pixels.measures import Sights, localisation_rows, recall_rows
+from bikeped.pixels.run import PixelRun
+from bikeped.types import Kind
+
+#: Sensitivity and specificity from pixels may lie this far from the scripted run's, in share.
+GOAL = 0.03
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How the scenarios were drawn, for the record."""
+
+    width: int
+    height: int
+    light: str
+    weather: str
+    place: int
+    seed: int
+
+
+def pixels_result(
+    suite: Suite, runs: Sequence[PixelRun], rungs: Sequence[Rung], seen: Sights, drawing: Drawing
+) -> Result:
+    """All figures: `data` for JSON, and the tables that people read."""
+    scripted, whole = rungs[0].metrics, rungs[-1].metrics
+    data: dict[str, Any] = {
+        "drawing": {name: getattr(drawing, name) for name in Drawing.__dataclass_fields__},
+        "detector": runs[0].detector,
+        "model_hash": runs[0].model_hash,
+        "frames": seen.frames,
+        "goal": {
+            "within": GOAL,
+            "sensitivity_change": number(whole.sensitivity - scripted.sensitivity),
+            "specificity_change": number(whole.specificity - scripted.specificity),
+            "holds": within_goal(rungs),
+        },
+        "stages": [_stage(rungs, i) for i in range(len(rungs))],
+        "by_scenario": {
+            name: {
+                "scripted": scripted.scenario_dict(i),
+                "pixels": whole.scenario_dict(i),
+            }
+            for i, name in enumerate(suite.names)
+        },
+        "detection": {
+            "min_iou": MIN_IOU,
+            "min_visible": MIN_VISIBLE,
+            "by_distance": recall_rows(seen),
+            "false_per_100_frames": {
+                kind.label: 100 * count / max(seen.frames, 1) for kind, count in seen.false.items()
+            },
+        },
+        "localisation": localisation_rows(seen),
+        "paper_localisation": error_table(suite.camera),
+    }
+    return Result("pixels", data, _tables(data, rungs, suite, scripted, whole))
+
+
+def within_goal(rungs: Sequence[Rung]) -> bool:
+    """Whether sensitivity and specificity from pixels are within the goal of the scripted run's."""
+    first, last = rungs[0].metrics, rungs[-1].metrics
+    pairs = (
+        (first.sensitivity, last.sensitivity),
+        (first.specificity, last.specificity),
+    )
+    # Without actionable frames (or without safe ones) there is nothing to compare.
+    return all(math.isnan(a) or abs(a - b) <= GOAL for a, b in pairs)
+
+
+def verdict(rungs: Sequence[Rung]) -> str:
+    """In one or two sentences: how far from the scripted run, and where most of it is lost."""
+    parts = []
+    for name, label in (("sensitivity", "sensitivity"), ("specificity", "specificity")):
+        values = [float(getattr(r.metrics, name)) for r in rungs]
+        if math.isnan(values[0]):
+            parts.append(f"no frame counts for {label}")
+            continue
+        change = values[-1] - values[0]
+        text = f"{label} {100 * change:+.1f} points against the scripted run"
+        steps = [
+            (b - a, r.name) for a, b, r in zip(values[:-1], values[1:], rungs[1:], strict=True)
+        ]
+        worst = min(steps)
+        if worst[0] < -0.001:
+            text += f" (most is lost at {worst[1]}: {100 * worst[0]:+.1f})"
+        parts.append(text)
+    held = "within" if within_goal(rungs) else "not within"
+    return f"{'; '.join(parts)}: {held} {100 * GOAL:.0f} points."
+
+
+def _stage(rungs: Sequence[Rung], index: int) -> dict[str, Any]:
+    rung = rungs[index]
+    now = rung.metrics.as_dict()
+    change: dict[str, float | None] = {}
+    if index:
+        before = rungs[index - 1].metrics.as_dict()
+        for key in ("sensitivity", "specificity", "mean_warning_budget_s", "sev_fn", "fatigue"):
+            a, b = before[key], now[key]
+            change[key] = None if a is None or b is None else b - a
+    return {"name": rung.name, "adds": rung.adds, **now, "change": change}
+
+
+def _tables(
+    data: dict[str, Any],
+    rungs: Sequence[Rung],
+    suite: Suite,
+    scripted: Metrics,
+    whole: Metrics,
+) -> tuple[Table, ...]:
+    stages: list[tuple[Cell, ...]] = [
+        (rung.name, *shown(rung.metrics.as_dict())[:5], rung.adds) for rung in rungs
+    ]
+    scenarios: list[tuple[Cell, ...]] = []
+    for i, name in enumerate(suite.names):
+        a, b = scripted.scenario_dict(i), whole.scenario_dict(i)
+        scenarios.append(
+            (
+                name,
+                percent(a["sensitivity"]),
+                percent(b["sensitivity"]),
+                percent(a["specificity"]),
+                percent(b["specificity"]),
+                a["mean_warning_budget_s"],
+                b["mean_warning_budget_s"],
+            )
+        )
+    recall: list[tuple[Cell, ...]] = [
+        (r["kind"], f"{r['from_m']:g}-{r['to_m']:g}", r["seen"], *_percents(r, "found", "recall"))
+        for r in data["detection"]["by_distance"]
+        if r["seen"]
+    ]
+    false = data["detection"]["false_per_100_frames"]
+    note = ", ".join(f"{kind.label} {false[kind.label]:.2f}" for kind in Kind)
+    places: list[tuple[Cell, ...]] = [
+        (
+            r["kind"],
+            f"{r['from_m']:g}-{r['to_m']:g}",
+            r["found"],
+            *(_metres(r[k]) for k in ("mean_m", "p90_m", "exact_box_mean_m", "box_model_mean_m")),
+        )
+        for r in data["localisation"]
+        if r["found"]
+    ]
+    return (
+        Table(
+            "stages",
+            "From the scripted run to pixels, stage by stage",
+            ("stage", *SHOWN_COLUMNS[:5], "what it adds"),
+            stages,
+        ),
+        Table(
+            "scenarios",
+            "Scripted and from pixels, by scenario",
+            ("scenario", "sens, %", "pixels, %", "spec, %", "pixels %", "budget, s", "pixels, s"),
+            scenarios,
+        ),
+        Table(
+            "recall",
+            "Found by the detector, by distance",
+            ("kind", "distance, m", "seen", "found, %", "as itself, %"),
+            recall,
+            note=f"false detections per 100 frames: {note}",
+        ),
+        Table(
+            "localisation",
+            "Localisation error by distance, metres",
+            ("kind", "distance, m", "found", "mean", "90th", "exact box", "box model"),
+            places,
+            note="box model: the simulation's (the paper's table), over the same objects",
+        ),
+    )
+
+
+def _percents(row: dict[str, Any], *names: str) -> tuple[Cell, ...]:
+    return tuple(percent(row[name]) for name in names)
+
+
+def _metres(value: float | None) -> Cell:
+    return None if value is None else round(value, 3)

@@ -1,0 +1,120 @@
+"""Drawn scenarios through the deployed loop, and the ladder from the scripted run to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pixels_fakes import OracleEye
+
+from bikeped.config import LoadedConfig, load_config
+from bikeped.conformance.scenario import Scenario, bundled_folder, load_scenarios
+from bikeped.conformance.suite import Suite
+from bikeped.conformance.truth import judge_truth
+from bikeped.pixels.ladder import ladder
+from bikeped.pixels.matching import MIN_VISIBLE
+from bikeped.pixels.measures import localisation_rows, recall_rows, sights
+from bikeped.pixels.report import Drawing, pixels_result, verdict
+from bikeped.pixels.run import PixelRun, run_scenario
+from bikeped.scene import Conditions, ScenePainter, scene_camera
+from bikeped.types import Detections, Kind
+
+SIZE = (960, 540)
+
+
+@pytest.fixture(scope="module")
+def loaded() -> LoadedConfig:
+    return load_config()
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    """The shortest one in which somebody must be warned."""
+    known = sorted(load_scenarios(bundled_folder()), key=lambda s: s.duration_s)
+    return next(s for s in known if judge_truth(s).actionable.any())
+
+
+@pytest.fixture(scope="module")
+def run(loaded: LoadedConfig, scenario: Scenario) -> PixelRun:
+    """With an eye that sees all that can be seen, and one bush that it takes for a walker."""
+    painter = ScenePainter(scenario, scene_camera(loaded, SIZE), Conditions())
+    times = scenario.frame_times().tolist()
+
+    def boxes(frame: int) -> Detections:
+        seen = [o for o in painter.objects(times[frame]) if o.visible >= MIN_VISIBLE]
+        kinds = [int(o.label) for o in seen] + [int(Kind.PEDESTRIAN)]
+        corners = [o.box_px for o in seen] + [(3.0, 380.0, 9.0, 400.0)]
+        return Detections(
+            np.asarray(kinds, np.int8),
+            np.ones(len(kinds), np.float32),
+            np.asarray(corners, np.float32),
+        )
+
+    return run_scenario(loaded, scenario, Conditions(), SIZE, OracleEye(boxes))
+
+
+def test_every_frame_is_decided_once(run: PixelRun, scenario: Scenario) -> None:
+    frames = len(scenario.frame_times())
+    assert len(run.state) == len(run.objects) == len(run.detections) == frames
+
+
+def test_a_perfect_eye_loses_nothing_between_occlusion_and_its_boxes(
+    run: PixelRun, scenario: Scenario, loaded: LoadedConfig
+) -> None:
+    suite = Suite.load([scenario], loaded)
+    rungs = {r.name: r for r in ladder(suite, [run], loaded, loaded.config.decision)}
+    for name in ("misses", "boxes", "kinds"):
+        np.testing.assert_array_equal(rungs[name].states, rungs["occlusion"].states)
+    # The bush is a pedestrian for ever: nobody is IDLE with it.
+    assert not (rungs["false detections"].states[5:] == 0).any()
+    assert rungs["false detections"].metrics.sensitivity == pytest.approx(
+        rungs["scripted"].metrics.sensitivity, abs=0.35
+    )
+
+
+def test_the_loop_and_the_ladder_decide_alike(
+    run: PixelRun, scenario: Scenario, loaded: LoadedConfig
+) -> None:
+    """The last rung comes out of the loop, the others out of its judge: same boxes, same states."""
+    from bikeped.pixels.ladder import _judge_boxes
+    from bikeped.service.judge import Judge
+
+    again = _judge_boxes(Judge(loaded), run, lambda r, f: r.detections[f])
+    np.testing.assert_array_equal(again, run.state)
+
+
+def test_measures_of_a_perfect_eye(run: PixelRun, scenario: Scenario, loaded: LoadedConfig) -> None:
+    suite = Suite.load([scenario], loaded)
+    seen = sights([run], suite.seen, loaded)
+    assert seen.false[Kind.PEDESTRIAN] == len(run.state)
+    assert seen.false[Kind.CYCLIST] == seen.false[Kind.VEHICLE] == 0
+    rows = [r for r in recall_rows(seen) if r["seen"]]
+    assert rows
+    assert all(r["recall"] == r["found"] == 1.0 for r in rows)
+    for row in localisation_rows(seen):
+        if row["found"]:
+            assert row["mean_m"] == pytest.approx(row["exact_box_mean_m"], abs=1e-5)
+    near = (seen.kind == Kind.PEDESTRIAN) & (seen.distance_m < 15)
+    assert np.nanmean(seen.exact_m[near]) < 1.0
+
+
+def test_an_eye_that_sees_nothing_is_named(
+    run: PixelRun, scenario: Scenario, loaded: LoadedConfig
+) -> None:
+    blind = replace(
+        run,
+        detections=tuple(Detections.empty() for _ in run.detections),
+        state=np.zeros_like(run.state),
+    )
+    suite = Suite.load([scenario], loaded)
+    rungs = ladder(suite, [blind], loaded, loaded.config.decision)
+    assert rungs[-1].metrics.sensitivity == 0.0
+    text = verdict(rungs)
+    assert "misses" in text
+    assert "not within 3 points" in text
+    seen = sights([blind], suite.seen, loaded)
+    result = pixels_result(suite, [blind], rungs, seen, Drawing(*SIZE, "day", "dry", 0, 0))
+    assert result.data["goal"]["holds"] is False
+    assert result.data["stages"][0]["name"] == "scripted"
+    assert {t.name for t in result.tables} == {"stages", "scenarios", "recall", "localisation"}

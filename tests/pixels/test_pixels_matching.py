@@ -1,0 +1,53 @@
+"""Which detection is which object."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from pixels_fakes import drawn, found
+
+from bikeped.pixels.matching import iou, match
+from bikeped.types import Detections, Kind
+
+WALKER, RIDER = Kind.PEDESTRIAN, Kind.CYCLIST
+BOX = (10.0, 10.0, 20.0, 40.0)
+
+
+def test_the_best_overlap_wins_and_nobody_is_matched_twice() -> None:
+    objects = [drawn(1, WALKER, BOX), drawn(2, WALKER, (14, 10, 24, 40))]
+    detections = found((WALKER, (11, 10, 21, 40)), (WALKER, BOX), (WALKER, (80, 80, 90, 99)))
+    matched = match(detections, objects)
+    assert matched.object.tolist() == [1, 0, -1]
+    assert matched.found.tolist() == [1, 0]
+
+
+def test_the_right_kind_comes_first_and_a_wrong_one_still_counts_as_found() -> None:
+    objects = [drawn(1, WALKER, BOX)]
+    both = found((RIDER, BOX), (WALKER, (11, 11, 21, 41)))
+    assert match(both, objects).object.tolist() == [-1, 0]
+    assert match(found((RIDER, BOX)), objects).object.tolist() == [0]
+
+
+def test_touching_is_not_matching() -> None:
+    assert match(found((WALKER, (20, 10, 30, 40))), [drawn(1, WALKER, BOX)]).found.tolist() == [-1]
+
+
+def test_nothing_matches_nothing() -> None:
+    assert match(Detections.empty(), [drawn(1, WALKER, BOX)]).found.tolist() == [-1]
+    assert match(found((WALKER, BOX)), []).object.tolist() == [-1]
+
+
+coordinate = st.floats(0, 100, allow_nan=False)
+
+
+@given(st.lists(st.tuples(coordinate, coordinate, coordinate, coordinate), min_size=1, max_size=5))
+def test_overlap_is_a_share_and_one_with_itself(corners: list[tuple[float, ...]]) -> None:
+    boxes = np.asarray(
+        [[min(a, c), min(b, d), max(a, c) + 1, max(b, d) + 1] for a, b, c, d in corners]
+    )
+    table = iou(boxes, boxes)
+    assert (table >= 0).all()
+    assert (table <= 1 + 1e-9).all()
+    np.testing.assert_allclose(np.diag(table), 1.0)
+    np.testing.assert_allclose(table, table.T)
