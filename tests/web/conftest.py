@@ -24,6 +24,7 @@ import pytest
 from aiohttp import web
 from axe_playwright_python.base import AXE_SCRIPT
 from playwright.sync_api import Browser, BrowserContext, Page, Playwright, sync_playwright
+from web_fakes import DESKTOP
 
 from bikeped.config import WebConfig
 from bikeped.telemetry.http import HttpServer
@@ -39,9 +40,6 @@ ARGUMENTS = [
     "--disable-sync",
     "--force-color-profile=srgb",
 ]
-#: Sizes to look at: a phone held upright, a projector.
-PHONE = {"width": 390, "height": 844}
-DESKTOP = {"width": 1440, "height": 900}
 PATIENCE_S = 30.0  # reached only by a failure
 
 
@@ -120,15 +118,14 @@ def browser(playwright: Playwright) -> Iterator[Browser]:
 _errors: dict[Page, list[str]] = {}
 
 
-@pytest.fixture
-def page_errors() -> Callable[[Page], list[str]]:
+def page_errors(page: Page) -> list[str]:
     """What went wrong in a page so far: console errors, exceptions, requests that failed."""
-    return lambda page: _errors[page]
+    return _errors[page]
 
 
 @pytest.fixture
 def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Opens an address in a fresh context; `viewport` PHONE or DESKTOP, `scheme` light or dark,
+    """Opens an address in a fresh context; `viewport` (of web_fakes), `scheme` light or dark,
     further keywords as `browser.new_context` takes them."""
     contexts: list[BrowserContext] = []
 
@@ -136,7 +133,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
         url: str, viewport: dict[str, int] = DESKTOP, scheme: str = "light", **options: Any
     ) -> Page:
         options.setdefault("reduced_motion", "reduce")
-        options.setdefault("has_touch", viewport is PHONE)
+        options.setdefault("has_touch", viewport["width"] < 600)
         contexts.append(browser.new_context(viewport=viewport, color_scheme=scheme, **options))
         contexts[-1].set_default_timeout(PATIENCE_S * 1e3)
         page = contexts[-1].new_page()
