@@ -15,6 +15,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 #: Parameters of commands that name what is read, and what is written, and how people know them.
 _INPUTS = {
     "video": "VIDEO",
+    "scenario": "SCENARIO",
     "config_path": "-c",
     "candidate": "CANDIDATE",
     "scenarios_dir": "--scenarios",

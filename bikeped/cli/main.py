@@ -21,6 +21,8 @@ COMMANDS = {
     "doctor": "bikeped.cli.doctor",
     "align": "bikeped.cli.align",
     "conformance": "bikeped.cli.conformance",
+    "testbench": "bikeped.cli.testbench",
+    "scene": "bikeped.cli.scene",
     "model": "bikeped.cli.model",
 }
 

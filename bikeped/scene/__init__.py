@@ -13,7 +13,8 @@ from bikeped.scene.chance import random_camera, random_scenario
 from bikeped.scene.clip import ClipTruth, read_sidecar, sidecar_path, write_clip
 from bikeped.scene.conditions import LIGHTS, WEATHERS, Conditions, random_conditions
 from bikeped.scene.dataset import pictures, write_dataset
-from bikeped.scene.painter import KINDS, DrawnObject, ScenePainter
+from bikeped.scene.labels import KINDS, DrawnObject
+from bikeped.scene.painter import ScenePainter
 
 __all__ = [
     "DEFAULT_POSE",

@@ -25,11 +25,11 @@ _SAMPLES = (-0.375, -0.125, 0.125, 0.375)
 
 @dataclass(frozen=True)
 class Standing:
-    """A fixture, its mesh and how it looks (None: out of the picture)."""
+    """A fixture in the picture, its mesh and how it looks."""
 
     item: Fixture
     mesh: Mesh
-    sprite: Sprite | None
+    sprite: Sprite
 
 
 @dataclass(frozen=True)
@@ -48,19 +48,12 @@ class Backdrop:
 
     def lamplight(self, xy_m: FloatArray) -> FloatArray | None:
         """Light of the street lamps at a place on the ground [3]; None by day."""
-        if not self.light.lamps:
-            return None
-        return np.asarray(_lamp_pools(self.place, np.asarray(xy_m, np.float32)[None])[0] * 1.0)
-
-
-def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
-    """The backdrop; the last few are kept, for scenarios that share one."""
-    # What only moves noise about must not draw the street anew.
-    return _backdrop(view, conditions)
+        return _lamplight(self.place, self.light, xy_m)
 
 
 @lru_cache(maxsize=2)
-def _backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
+def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
+    """The backdrop; the last two are kept, for scenarios that share one."""
     light, where, ray = lighting(conditions), place(conditions.place), rays(view)
     canvas = _sky(ray, light, conditions)
     _ground(canvas, ray, view, where, light)
@@ -72,17 +65,13 @@ def _backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
     )
     image[~ray.lit] = 0
     standing = []
-    for item in where.fixtures:
-        mesh = fixture(item)
-        away = float(np.hypot(*(np.array(item.xy_m) - view.eye_m[:2])))
-        local = (
-            _lamp_pools(where, np.array([item.xy_m], np.float32))[0].astype(np.float64)
-            if light.lamps
-            else None
-        )
-        standing.append(
-            Standing(item, mesh, rasterise(mesh, view, light, local=local, away_m=away))
-        )
+    for thing in where.fixtures:
+        mesh = fixture(thing)
+        away = float(np.hypot(*(np.array(thing.xy_m) - view.eye_m[:2])))
+        local = _lamplight(where, light, np.array(thing.xy_m))
+        sprite = rasterise(mesh, view, light, local=local, away_m=away)
+        if sprite is not None:
+            standing.append(Standing(thing, mesh, sprite))
     return Backdrop(view, conditions, light, where, image, ray.lit, ray.vignette, tuple(standing))
 
 
@@ -183,17 +172,19 @@ def _looked_up(
 ) -> Float32Array:
     """The map's colours at ground positions, averaged over points `offsets` of the pixel's depth;
     beyond its edges the edge goes on."""
-    total: Float32Array | None = None
+    total = np.zeros((*x.shape, 3), np.float32)
     for offset in offsets:
         u = (x + along[0] * offset - source.x0) / source.res - 0.5
         v = (y + along[1] * offset - source.y0) / source.res - 0.5
-        part = np.asarray(
-            cv2.remap(source.image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-            np.float32,
-        )
-        total = part if total is None else total + part
-    assert total is not None
-    return total / len(offsets)
+        part = cv2.remap(source.image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        total += np.asarray(part, np.uint8)
+    return total / np.float32(len(offsets))
+
+
+def _lamplight(where: Place, light: Lighting, xy_m: FloatArray) -> FloatArray | None:
+    if not light.lamps:
+        return None
+    return np.asarray(_lamp_pools(where, xy_m.astype(np.float32)[None])[0], np.float64)
 
 
 def _lamp_pools(where: Place, xy: Float32Array) -> Float32Array:

@@ -165,10 +165,10 @@ def rays(view: SceneCamera) -> Rays:
     )
     lit = fine[..., 3] < rim
     u1, v1, u2, v2 = view.window()
-    lit[: int(round(v1))] = False
-    lit[int(round(v2)) :] = False
-    lit[:, : int(round(u1))] = False
-    lit[:, int(round(u2)) :] = False
+    lit[: round(v1)] = False
+    lit[round(v2) :] = False
+    lit[:, : round(u1)] = False
+    lit[:, round(u2) :] = False
     edge = fine[..., 4]
     vignette = (1.0 - 0.42 * edge**3) * np.clip((1.0 - edge) * 40, 0, 1)
     if view.camera.lens.projection == "perspective":

@@ -14,7 +14,8 @@ import simplejpeg
 from bikeped.errors import CaptureError
 from bikeped.files import write_whole
 from bikeped.scene.avi import AviWriter
-from bikeped.scene.painter import DrawnObject, ScenePainter
+from bikeped.scene.labels import DrawnObject
+from bikeped.scene.painter import ScenePainter
 from bikeped.types import ImageArray, Kind
 
 FORMAT = "bikeped drawn boxes 2"

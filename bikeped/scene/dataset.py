@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -19,7 +18,8 @@ from bikeped.scene.camera import SceneCamera
 from bikeped.scene.chance import random_camera, random_scenario
 from bikeped.scene.clip import encode_jpeg
 from bikeped.scene.conditions import Conditions, random_conditions
-from bikeped.scene.painter import DrawnObject, ScenePainter
+from bikeped.scene.labels import DrawnObject
+from bikeped.scene.painter import ScenePainter
 from bikeped.types import ImageArray, Kind
 
 CATEGORIES = [{"id": kind.value + 1, "name": kind.label} for kind in Kind]
@@ -43,13 +43,10 @@ def pictures(
     `camera`: for all of them; None draws a camera for every street (`lens`: fisheye or
     rectilinear). Equal arguments give equal pictures; a larger `count` begins with the same ones.
     """
-    conditions, view = Conditions(), camera
     for number in range(count):
         street = seed * 1_000_003 + number // _PER_STREET
-        if number % _PER_STREET == 0:
-            conditions = random_conditions(street)
-            view = camera or random_camera(street, size, lens)
-        assert view is not None
+        conditions = random_conditions(street)
+        view = camera or random_camera(street, size, lens)
         rng = np.random.default_rng((seed, number, 59))
         painter = ScenePainter(random_scenario(seed * 1_000_003 + number), view, conditions)
         image, objects = painter.draw(float(rng.uniform(0.2, 5.8)))
@@ -116,7 +113,7 @@ def write_dataset(
         partial.chmod(0o755)
         if folder.exists():
             folder.rmdir()
-        os.replace(partial, folder)
+        partial.replace(folder)
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
         raise BikepedError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from bikeped.conformance.scenario import SIZES_M
@@ -97,7 +99,7 @@ def _tree(rng: np.random.Generator) -> Mesh:
     tone = np.array([78.0, 110, 54]) + rng.normal(0, 10, 3)
     lobes = rng.normal(0, 0.5, (7, 3)) * (wide, wide, 0.8) + (0, 0, tall * 0.76)
     for lobe in lobes:
-        b.limb((0.1, 0.05, tall * 0.48), tuple(lobe), 0.08, 0.03, bark)  # type: ignore[arg-type]
+        b.limb((0.1, 0.05, tall * 0.48), tuple(lobe), 0.08, 0.03, bark)
     count = 420
     middle = lobes[rng.integers(0, 7, count)] + rng.normal(0, 0.42, (count, 3)) * (wide, wide, 1.0)
     middle[:, 2] = np.maximum(middle[:, 2], 2.2)
@@ -191,11 +193,11 @@ def house(item: House, lit_windows: bool) -> Mesh:
         x = item.x0 + column * pitch
         front(x, x + pitch, item.height - 0.35, item.height, tuple(c * 0.7 for c in item.wall), 1)  # type: ignore[arg-type]
     back = item.front + item.depth
+    ys = np.linspace(item.front, back, 5).tolist()
     for x, order in ((item.x0, 1), (item.x1, -1)):
-        ys = np.linspace(item.front, back, 5)
         for floor in range(floors):
             z0, z1 = floor * storey, (floor + 1) * storey
-            for y0, y1 in zip(ys, ys[1:], strict=False):
+            for y0, y1 in pairwise(ys):
                 face = [(x, y1, z0), (x, y0, z0), (x, y0, z1), (x, y1, z1)]
                 add(face[::order], tuple(c * 0.9 for c in item.wall))  # type: ignore[arg-type]
                 if (item.number >> floor) % 2:

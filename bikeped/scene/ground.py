@@ -75,7 +75,7 @@ class _Pen:
     def line(self, points: list[tuple[float, float]], wide_m: float, colour: Rgb) -> None:
         at = (np.array(points) - (self.x0, self.y0)) / self.res - 0.5
         fixed = np.round(at.clip(-1e5, 1e5) * (1 << _SHIFT)).astype(np.int32)
-        thick = max(int(round(wide_m / self.res)), 1)
+        thick = max(round(wide_m / self.res), 1)
         cv2.polylines(self.image, [fixed], False, colour, thick, cv2.LINE_AA, _SHIFT)
 
 
@@ -234,11 +234,11 @@ def _textured(image: ImageArray, where: Place, res: float) -> ImageArray:
     grain = np.clip(1.0 + 0.05 * tile, 0.7, 1.3)
     rows = np.random.default_rng(where.number).integers(0, 512, 2)
     grain = np.tile(np.roll(grain, tuple(rows.tolist()), (0, 1)), repeat)[:height, :width]
-    scale = min(res * 60 / 0.02 / 60, 8) * 24
+    # Stains of some metres: the same noise, drawn large.
+    part_y, part_x = (min(max(int(n * res * 2), 8), 512) for n in (height, width))
     big = np.asarray(
-        cv2.resize(tile[: max(int(height * res / scale * 48), 8), : max(int(width * res / scale * 48), 8)],
-                   (width, height), interpolation=cv2.INTER_LINEAR)
-    )  # fmt: skip
+        cv2.resize(tile[:part_y, :part_x], (width, height), interpolation=cv2.INTER_LINEAR)
+    )
     grain = grain + 0.035 * np.clip(big, -2.5, 2.5)
     out: ImageArray = np.asarray(
         cv2.multiply(image, cv2.merge([grain] * 3), dtype=cv2.CV_8U), np.uint8

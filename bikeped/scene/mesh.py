@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -145,7 +146,7 @@ class Builder:
         (x0, y0, z0), (x1, y1, z1) = low, high
         xs = np.linspace(x0, x1, pieces + 1)
         quads = []
-        for a, b in zip(xs, xs[1:], strict=False):
+        for a, b in pairwise(xs):
             quads += [
                 [(a, y0, z0), (b, y0, z0), (b, y0, z1), (a, y0, z1)],
                 [(b, y1, z0), (a, y1, z0), (a, y1, z1), (b, y1, z1)],

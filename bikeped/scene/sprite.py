@@ -55,12 +55,12 @@ def rasterise(
     `local` [3] is light from lamps at its place, added to the ambient light.
     """
     eye = view.eye_m
-    quads = mesh.quads
+    quads: FloatArray = mesh.quads
     normal = normals(quads)
     facing = np.einsum("ij,ij->i", eye - quads[:, 0], normal) > 0
     if not facing.any():
         return None
-    pixels = view.pixels(quads[facing].reshape(-1, 3)).reshape(-1, 4, 2)
+    pixels: FloatArray = view.pixels(quads[facing].reshape(-1, 3)).reshape(-1, 4, 2)
     kept = np.flatnonzero(facing)
     whole = _whole(pixels)
     if not whole.all():
@@ -81,7 +81,7 @@ def rasterise(
     fixed = np.round(
         ((pixels[order] - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)
     ).astype(np.int32)
-    canvas = np.zeros(((bottom - top) * scale, (right - left) * scale, 4), np.uint8)
+    canvas: ImageArray = np.zeros(((bottom - top) * scale, (right - left) * scale, 4), np.uint8)
     fill = cv2.fillConvexPoly
     for points, (r, g, b) in zip(fixed, colour.tolist(), strict=True):
         fill(canvas, points, (r, g, b, 255), cv2.LINE_8, _SHIFT)
@@ -116,7 +116,7 @@ def shaded(
 
 
 def shadow(
-    quads: FloatArray, view: SceneCamera, to_sun: FloatArray, softness: float
+    quads: FloatArray, view: SceneCamera, to_sun: FloatArray, softness: int
 ) -> tuple[int, int, Float32Array] | None:
     """Where faces [n, 4, 3] keep the sun off the ground: left, top and coverage [h, w] 0..1."""
     normal = normals(quads)
@@ -127,7 +127,7 @@ def shadow(
     flat = lit.copy()
     flat[..., :2] -= lit[..., 2:] * slope
     flat[..., 2] = 0
-    pixels = view.pixels(flat.reshape(-1, 3)).reshape(-1, 4, 2)
+    pixels: FloatArray = view.pixels(flat.reshape(-1, 3)).reshape(-1, 4, 2)
     pixels = pixels[_whole(pixels)]
     if len(pixels) == 0:
         return None
@@ -136,34 +136,37 @@ def shadow(
         return None
     left, top, right, bottom = bounds
     scale = 2 if max(right - left, bottom - top) < 160 else 1
-    canvas = np.zeros(((bottom - top) * scale, (right - left) * scale), np.uint8)
+    canvas: ImageArray = np.zeros(((bottom - top) * scale, (right - left) * scale), np.uint8)
     fixed = np.round(((pixels - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT))
-    for points in fixed.astype(np.int32):
-        cv2.fillConvexPoly(canvas, points, 255, cv2.LINE_8, _SHIFT)
+    faces = fixed.astype(np.int32)
+    for i in range(len(faces)):
+        cv2.fillConvexPoly(canvas, faces[i], 255, cv2.LINE_8, _SHIFT)
     if scale > 1:
         canvas = np.asarray(
             cv2.resize(canvas, (right - left, bottom - top), interpolation=cv2.INTER_AREA), np.uint8
         )
-    blur = max(int(softness), 0) * 2 + 1
+    blur = max(softness, 0) * 2 + 1
     out = cv2.GaussianBlur(canvas, (blur, blur), 0) if blur > 1 else canvas
-    return left, top, np.asarray(out, np.float32) / 255
+    return left, top, np.asarray(out, np.float32) / np.float32(255)
 
 
-def halo(radius_px: float) -> Float32Array:
-    """A round glow [2r + 1, 2r + 1] falling from 1 to 0."""
-    r = max(int(radius_px), 1)
-    y, x = np.mgrid[-r : r + 1, -r : r + 1].astype(np.float32)
-    d = np.hypot(x, y) / r
-    core: Float32Array = (np.clip(1 - d, 0, 1) ** 2.5).astype(np.float32)
-    return core
+def touch(one: Sprite, other: Sprite) -> bool:
+    """Whether two sprites' rectangles overlap."""
+    (h, w), (k, v) = one.alpha.shape, other.alpha.shape
+    return (
+        one.left < other.left + v
+        and other.left < one.left + w
+        and one.top < other.top + k
+        and other.top < one.top + h
+    )
 
 
 def inside(
-    view_size: tuple[int, int], left: int, top: int, width: int, height: int
+    size: tuple[int, int], left: int, top: int, width: int, height: int
 ) -> tuple[slice, slice, slice, slice] | None:
-    """Rows and columns of the picture and of a patch of this place that overlap."""
+    """Rows and columns of a picture of `size` and of a patch at this place that overlap."""
     x0, y0 = max(left, 0), max(top, 0)
-    x1, y1 = min(left + width, view_size[0]), min(top + height, view_size[1])
+    x1, y1 = min(left + width, size[0]), min(top + height, size[1])
     if x1 <= x0 or y1 <= y0:
         return None
     return (

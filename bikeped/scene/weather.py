@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import cv2
@@ -25,33 +26,35 @@ class Weather:
 
     def apply(self, image: ImageArray, t_s: float) -> None:
         """Adds rain, glare and noise as they are at `t_s`."""
-        rng = np.random.default_rng(
-            (self._backdrop.conditions.seed, int(round(t_s * 1000)) & 0xFFFFFFFF)
-        )
+        moment = round(t_s * 1000) & 0xFFFFFFFF
+        rng = np.random.default_rng((self._backdrop.conditions.seed, moment))
+        first, second, third, fourth = (int(v) for v in rng.integers(0, _TILE, 4))
         if self._rain is not None:
-            _tiled(image, self._rain, rng, cv2.add)
+            _tiled(image, self._rain, (first, second), cv2.add)
         if self._flare is not None:
             cv2.add(image, self._flare, dst=image)
         plus, minus = self._noise
-        offset = rng.integers(0, _TILE, 2)
-        _tiled(image, plus, rng, cv2.add, offset)
-        _tiled(image, minus, rng, cv2.subtract, offset)
+        _tiled(image, plus, (third, fourth), cv2.add)
+        _tiled(image, minus, (third, fourth), cv2.subtract)
 
 
-def _tiled(image, tile, rng, operation, offset=None):  # type: ignore[no-untyped-def]
-    """Lays `tile` over the picture from a random corner on."""
-    if offset is None:
-        offset = rng.integers(0, _TILE, 2)
+def _tiled(
+    image: ImageArray,
+    tile: ImageArray,
+    offset: tuple[int, int],
+    operation: Callable[[ImageArray, ImageArray, ImageArray], object],
+) -> None:
+    """Lays `tile` over the picture, beginning at its row and column `offset`."""
     height, width = image.shape[:2]
     size_y, size_x = tile.shape[:2]
-    for top in range(-int(offset[0]) % size_y - size_y, height, size_y):
-        for left in range(-int(offset[1]) % size_x - size_x, width, size_x):
+    for top in range(-offset[0] % size_y - size_y, height, size_y):
+        for left in range(-offset[1] % size_x - size_x, width, size_x):
             y0, x0 = max(top, 0), max(left, 0)
             y1, x1 = min(top + size_y, height), min(left + size_x, width)
             if y1 <= y0 or x1 <= x0:
                 continue
             part = image[y0:y1, x0:x1]
-            operation(part, tile[y0 - top : y1 - top, x0 - left : x1 - left], dst=part)
+            operation(part, tile[y0 - top : y1 - top, x0 - left : x1 - left], part)
 
 
 @lru_cache(maxsize=8)
@@ -70,7 +73,7 @@ def _noise_tiles(deviation: float) -> tuple[ImageArray, ImageArray]:
 def _rain_tiles(size: tuple[int, int]) -> ImageArray:
     """Streaks of falling drops [512, 512, 3], as long as the picture is large."""
     rng = np.random.default_rng(815)
-    tile = np.zeros((_TILE, _TILE), np.uint8)
+    tile: ImageArray = np.zeros((_TILE, _TILE), np.uint8)
     unit = size[1] / 1080
     for _ in range(70):
         x, y = rng.uniform(0, _TILE, 2)

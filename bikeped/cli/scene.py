@@ -1,0 +1,307 @@
+"""`bikeped scene`: a scenario as fisheye video with exact boxes, a still, or a data set."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
+from bikeped.cli.guard import check_outputs, guarded
+from bikeped.config import LoadedConfig, load_config
+from bikeped.errors import BikepedError, GeometryError, ScenarioError
+from bikeped.files import write_whole
+
+if TYPE_CHECKING:
+    from bikeped.conformance.scenario import Scenario
+    from bikeped.scene import DrawnObject, SceneCamera, ScenePainter
+    from bikeped.types import ImageArray
+
+_LIGHTS = ("day", "overcast", "dusk", "night", "glare")
+_COLOURS = ((255, 70, 60), (70, 230, 90), (70, 160, 255))
+
+
+@click.command("scene")
+@click.argument("scenario", required=False)
+@config_options
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="The clip (.avi, Motion JPEG; boxes go beside it), or the data set's folder.",
+)
+@click.option("--size", default="1920x1080", show_default=True, help="Of the pictures, in pixels.")
+@click.option("--light", type=click.Choice(_LIGHTS), default="day", show_default=True)
+@click.option("--weather", type=click.Choice(["dry", "rain"]), default="dry", show_default=True)
+@click.option(
+    "--place",
+    type=click.IntRange(0, 2**31 - 1),
+    default=0,
+    show_default=True,
+    help="Road layout, houses and occluders by number.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**31 - 1),
+    default=0,
+    show_default=True,
+    help="Clothes, sun, noise; with --dataset everything.",
+)
+@click.option("--fps", type=click.IntRange(1, 240), default=30, show_default=True)
+@click.option("--seconds", type=click.FloatRange(min=0.001), help="Only the beginning.")
+@click.option("--quality", type=click.IntRange(1, 100), default=88, show_default=True)
+@click.option(
+    "--still",
+    type=(float, click.Path(path_type=Path)),
+    metavar="T FILE.png",
+    help="One picture at T seconds in place of a clip.",
+)
+@click.option("--boxes", is_flag=True, help="Draw the boxes into the still.")
+@click.option(
+    "--dataset",
+    type=click.IntRange(1, 1_000_000),
+    metavar="N",
+    help="N random pictures with COCO annotations into the folder --out; takes no SCENARIO.",
+)
+@click.option(
+    "--lens",
+    type=click.Choice(["configured", "fisheye", "rectilinear"]),
+    default="configured",
+    show_default=True,
+    help="Cameras of a data set: the configured one, or random ones of a sort.",
+)
+@json_option
+@guarded
+def command(
+    scenario: str | None,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    out: Path | None,
+    size: str,
+    light: str,
+    weather: str,
+    place: int,
+    seed: int,
+    fps: int,
+    seconds: float | None,
+    quality: int,
+    still: tuple[float, Path] | None,
+    boxes: bool,
+    dataset: int | None,
+    lens: str,
+    json_path: str | None,
+) -> None:
+    """Draw SCENARIO (a file, or the name of a bundled one) as the configured camera sees it."""
+    from bikeped.scene import Conditions, ScenePainter
+
+    loaded = load_config(config_path, overrides)
+    wide_high = _size(size)
+    if dataset is not None:
+        if scenario is not None:
+            raise BikepedError(f"{scenario}: --dataset draws its own scenarios; leave it out")
+        if out is None or still is not None:
+            raise BikepedError("--dataset: takes --out FOLDER and no --still; name a new folder")
+        summary = _dataset(loaded, out, dataset, seed, wide_high, lens)
+        _tell(summary, json_path, f"wrote {dataset} pictures and {summary['annotations']}")
+        return
+    if scenario is None:
+        raise BikepedError(
+            "SCENARIO: missing; name a scenario file or a bundled one, e.g. safe-crossing"
+        )
+    if (out is None) == (still is None):  # one of them
+        raise BikepedError("--out: give either --out CLIP.avi or --still T FILE.png")
+    found = _scenario(scenario)
+    source = Path(found.source)
+    conditions = Conditions(seed=seed, light=light, weather=weather, place=place)
+    view = _camera(loaded, wide_high)
+    if still is not None:
+        written = [("--still", still[1])]
+        if json_path not in (None, "-"):
+            written.append(("--json", Path(str(json_path))))
+        read = [("SCENARIO", source)] + ([("-c", config_path)] if config_path else [])
+        check_outputs(read, written)
+        summary = _still(ScenePainter(found, view, conditions), *still, boxes=boxes)
+        _tell(summary, json_path, f"wrote {still[1]}: {len(summary['objects'])} objects")
+        return
+    if out is None:
+        return
+    if boxes:
+        raise BikepedError("--boxes: goes with --still; a clip's boxes lie beside it")
+    if seconds is not None and not math.isfinite(seconds):
+        raise BikepedError(f"--seconds {seconds}: is not a number of seconds; give e.g. 5")
+    summary = _clip(ScenePainter(found, view, conditions), out, source, fps, quality, seconds)
+    _tell(
+        summary,
+        json_path,
+        f"wrote {out}: {summary['frames']} frames of {size}, {summary['duration_s']:.1f} s; "
+        f"boxes in {summary['boxes']}",
+    )
+
+
+def _clip(
+    painter: ScenePainter, out: Path, source: Path, fps: int, quality: int, seconds: float | None
+) -> dict[str, Any]:
+    from bikeped.scene import read_sidecar, sidecar_path, write_clip
+    from bikeped.scene.clip import frame_times
+
+    check_outputs([("SCENARIO", source)], [("--out", out), ("--out", sidecar_path(out))])
+    times = frame_times(painter, fps, seconds)
+    with progress_bar("drawing", len(times)) as tell:
+        beside = write_clip(
+            painter,
+            out,
+            fps=fps,
+            quality=quality,
+            seconds=seconds,
+            progress=lambda done, _: tell(done),
+        )
+    truth = read_sidecar(beside)
+    seen: dict[str, set[int]] = {}
+    for frame in truth.frames:
+        for item in frame:
+            seen.setdefault(item.kind, set()).add(item.id)
+    return {
+        "scenario": painter.scenario.name,
+        "clip": str(out),
+        "boxes": str(beside),
+        "frames": len(truth.frames),
+        "duration_s": round(len(truth.frames) / fps, 3),
+        "size": list(painter.camera.size),
+        "conditions": truth.header["conditions"],
+        "seen": {kind: len(ids) for kind, ids in sorted(seen.items())},
+    }
+
+
+def _still(painter: ScenePainter, t: float, path: Path, *, boxes: bool) -> dict[str, Any]:
+    import cv2
+    import numpy as np
+
+    if path.suffix.lower() not in {".png", ".jpg"}:
+        raise BikepedError(f"{path}: is not a .png or .jpg name; end the still's name with .png")
+    if not (math.isfinite(t) and 0 <= t <= painter.scenario.duration_s):
+        raise BikepedError(
+            f"--still {t}: is not in 0 to {painter.scenario.duration_s:g} s, where the scenario is"
+        )
+    image, objects = painter.draw(t)
+    if boxes:
+        _mark(image, objects)
+    done, data = cv2.imencode(path.suffix.lower(), np.ascontiguousarray(image[..., ::-1]))
+    if not done:
+        raise BikepedError(f"{path}: the picture could not be encoded; try a .png name")
+    write_whole(path, data.tobytes())
+    return {
+        "scenario": painter.scenario.name,
+        "still": str(path),
+        "t": t,
+        "size": list(painter.camera.size),
+        "objects": [
+            {
+                "id": item.id,
+                "kind": item.kind,
+                "box_px": [round(v, 2) for v in item.box_px],
+                "visible": round(item.visible, 3),
+                "distance_m": round(item.distance_m, 2),
+            }
+            for item in objects
+        ],
+    }
+
+
+def _mark(image: ImageArray, objects: list[DrawnObject]) -> None:
+    import cv2
+
+    for item in objects:
+        u1, v1, u2, v2 = (round(v) for v in item.box_px)
+        cv2.rectangle(image, (u1, v1), (u2, v2), _COLOURS[item.label], 1)
+        text = f"{item.kind} {item.distance_m:.1f} m"
+        cv2.putText(
+            image, text, (u1, v1 - 3), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 90), 1, cv2.LINE_AA
+        )
+
+
+def _dataset(
+    loaded: LoadedConfig, out: Path, count: int, seed: int, size: tuple[int, int], lens: str
+) -> dict[str, Any]:
+    from bikeped.scene import write_dataset
+
+    camera = _camera(loaded, size) if lens == "configured" else None
+    with progress_bar("drawing", count) as tell:
+        annotations = write_dataset(
+            out,
+            count,
+            seed,
+            camera,
+            size=size,
+            lens="fisheye" if lens == "configured" else lens,
+            progress=lambda done, _: tell(done),
+        )
+    return {
+        "folder": str(out),
+        "annotations": str(annotations),
+        "pictures": count,
+        "size": list(size),
+        "seed": seed,
+        "lens": lens,
+    }
+
+
+def _camera(loaded: LoadedConfig, size: tuple[int, int]) -> SceneCamera:
+    """The configured camera for pictures of `size`, which must have the sensor's proportions."""
+    from bikeped.scene import scene_camera
+
+    try:
+        return scene_camera(loaded, size)
+    except GeometryError as error:
+        sensor = loaded.config.camera
+        raise BikepedError(
+            f"--size {size[0]}x{size[1]}: {loaded.source}: the sensor has {sensor.width} x "
+            f"{sensor.height} pixels (camera.width, camera.height); take a scaled copy of that, "
+            f"e.g. {sensor.width // 2}x{sensor.height // 2}"
+        ) from error
+
+
+def _scenario(name: str) -> Scenario:
+    """A scenario file, or a bundled scenario by its name or its file's."""
+    from bikeped.conformance.scenario import bundled_folder, load_scenario, load_scenarios
+
+    path = Path(name)
+    if path.suffix in {".yaml", ".yml"} or path.exists():
+        return load_scenario(path)
+    slug = _slug(name)
+    known = load_scenarios(bundled_folder())
+    for scenario in known:
+        if slug in {_slug(scenario.name), Path(scenario.source).stem}:
+            return scenario
+    names = ", ".join(Path(scenario.source).stem for scenario in known)
+    raise ScenarioError(f"{name}: is no scenario file and no bundled scenario; known: {names}")
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    if match is None:
+        raise BikepedError(f"--size {text}: is not WIDTHxHEIGHT; write e.g. 1920x1080")
+    return int(match[1]), int(match[2])
+
+
+def _tell(summary: dict[str, Any], json_path: str | None, line: str) -> None:
+    if json_path is not None:
+        write_json(summary, json_path)
+    if json_path == "-":
+        return
+    screen = console(json_path)
+    screen.print(line)
+    if "seen" in summary:
+        shown = ", ".join(f"{count} {kind}" for kind, count in summary["seen"].items()) or "nobody"
+        screen.print(f"in it: {shown}")
+    for item in summary.get("objects", ()):
+        u1, v1, u2, v2 = item["box_px"]
+        screen.print(
+            f"  {item['id']:>4} {item['kind']:<11}{item['distance_m']:6.2f} m  "
+            f"box {u1:.0f} {v1:.0f} {u2:.0f} {v2:.0f}  visible {item['visible']:.0%}"
+        )

@@ -1,0 +1,142 @@
+"""What is to be seen of everybody in a picture: who hides whom, and tight boxes. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bikeped.geometry import CameraPose
+from bikeped.scene.sprite import Sprite, inside, touch
+from bikeped.types import BoolArray, Float32Array, FloatArray, Kind
+
+#: What each kind of agent counts as: the default configuration's classes.
+KINDS: dict[str, Kind] = {
+    "pedestrian": Kind.PEDESTRIAN,
+    "cyclist": Kind.CYCLIST,
+    "motorcycle": Kind.CYCLIST,
+    "car": Kind.VEHICLE,
+    "bus": Kind.VEHICLE,
+    "truck": Kind.VEHICLE,
+}
+_SEEN = 0.4  #: coverage of a pixel from which on it belongs to somebody
+_MIN_PX = 1.5  #: smaller than this on a side is not in the picture
+
+
+@dataclass(frozen=True)
+class DrawnObject:
+    """One road user in one picture.
+
+    `id` is the agent's; parked cars of the place have negative ones. `box_px`: u1, v1, u2, v2 of
+    the visible silhouette in pixels of the picture, from its edges; `full_box_px`: of the whole
+    silhouette, which may reach beyond the picture. `visible`: share of the silhouette that is
+    neither hidden nor outside the picture. `xy_m`: true ground centre in the camera ground frame,
+    `world_m` in the world; `heading_rad` counter-clockwise from east.
+    """
+
+    id: int
+    kind: str
+    label: Kind
+    box_px: tuple[float, float, float, float]
+    full_box_px: tuple[float, float, float, float]
+    visible: float
+    xy_m: tuple[float, float]
+    world_m: tuple[float, float]
+    heading_rad: float
+
+    @property
+    def distance_m(self) -> float:
+        """Along the ground from below the lens."""
+        return float(np.hypot(*self.xy_m))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Somebody or something that hides what is behind it; with a `kind`, it gets a label."""
+
+    sprite: Sprite
+    id: int
+    kind: str | None
+    xy_m: FloatArray  #: in the world
+    heading_rad: float
+
+
+def label(
+    candidates: list[Candidate], lit: BoolArray, pose: CameraPose, size: tuple[int, int]
+) -> list[DrawnObject]:
+    """Objects of the `candidates` that have a kind, far ones first as given, as far as they show.
+
+    `lit` [h, w]: where the lens reaches.
+    """
+    left: list[Float32Array | None] = []
+    for i, near in enumerate(candidates):
+        for far, cover in zip(candidates[:i], left, strict=True):
+            if cover is not None and touch(far.sprite, near.sprite):
+                _hide(cover, far.sprite, near.sprite)
+        whole = np.asarray(near.sprite.alpha, np.float32) / np.float32(255)
+        left.append(whole if near.kind is not None else None)
+    found = []
+    for item, cover in zip(candidates, left, strict=True):
+        if cover is not None and item.kind is not None:
+            drawn = _drawn(item, item.kind, cover, lit, pose, size)
+            if drawn is not None:
+                found.append(drawn)
+    return found
+
+
+def _hide(cover: Float32Array, far: Sprite, near: Sprite) -> None:
+    """Takes from `far`'s coverage what `near` covers."""
+    height, width = cover.shape
+    x0, y0 = max(near.left - far.left, 0), max(near.top - far.top, 0)
+    x1 = min(near.left + near.alpha.shape[1] - far.left, width)
+    y1 = min(near.top + near.alpha.shape[0] - far.top, height)
+    dx, dy = far.left - near.left, far.top - near.top
+    over = near.alpha[y0 + dy : y1 + dy, x0 + dx : x1 + dx]
+    cover[y0:y1, x0:x1] *= 1 - over.astype(np.float32) / 255
+
+
+def _drawn(
+    item: Candidate,
+    kind: str,
+    cover: Float32Array,
+    lit: BoolArray,
+    pose: CameraPose,
+    size: tuple[int, int],
+) -> DrawnObject | None:
+    sprite = item.sprite
+    spot = inside(size, sprite.left, sprite.top, cover.shape[1], cover.shape[0])
+    if spot is None:
+        return None
+    rows, columns, patch_rows, patch_columns = spot
+    shows = cover[patch_rows, patch_columns] * lit[rows, columns]
+    seen = shows >= _SEEN
+    across, down = np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1))
+    if len(across) == 0:
+        return None
+    raw = np.array(
+        [
+            columns.start + across[0],
+            rows.start + down[0],
+            columns.start + across[-1] + 1,
+            rows.start + down[-1] + 1,
+        ],
+        np.float64,
+    )
+    # Where the silhouette's own edge shows, it is known better than to a pixel.
+    full = np.array(sprite.full_box_px)
+    box = np.where(np.abs(raw - full) <= 1.5, full, raw)
+    box = np.clip(box, 0.0, (size[0], size[1], size[0], size[1]))
+    if (box[2:] - box[:2] < _MIN_PX).any():
+        return None
+    ground = pose.world_to_ground(item.xy_m)
+    return DrawnObject(
+        id=item.id,
+        kind=kind,
+        label=KINDS[kind],
+        box_px=(float(box[0]), float(box[1]), float(box[2]), float(box[3])),
+        full_box_px=sprite.full_box_px,
+        visible=float(min(shows.sum() / max(sprite.area_px, 1e-6), 1.0)),
+        xy_m=(float(ground[0]), float(ground[1])),
+        world_m=(float(item.xy_m[0]), float(item.xy_m[1])),
+        heading_rad=item.heading_rad,
+    )
