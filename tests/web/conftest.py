@@ -118,9 +118,10 @@ def browser(playwright: Playwright) -> Iterator[Browser]:
 _errors: dict[Page, list[str]] = {}
 
 
-def page_errors(page: Page) -> list[str]:
+@pytest.fixture
+def page_errors() -> Callable[[Page], list[str]]:
     """What went wrong in a page so far: console errors, exceptions, requests that failed."""
-    return _errors[page]
+    return lambda page: _errors[page]
 
 
 @pytest.fixture
