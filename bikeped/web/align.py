@@ -19,6 +19,7 @@ from aiohttp import hdrs, web
 from msgspec import Meta
 
 from bikeped.config import CameraConfig, LoadedConfig, framing, ground_camera, load_config
+from bikeped.errors import GeometryError
 from bikeped.geometry import GroundCamera
 from bikeped.geometry.alignment import PARAMETERS
 from bikeped.types import Frame
@@ -100,7 +101,7 @@ class Aligner:
             return json_answer(await asyncio.to_thread(self._grid, asked))
 
     async def fit(self, request: web.Request) -> web.Response:
-        """The numbers that explain the marks best."""
+        """The numbers that explain the marks best, or `refused`: why the marks do not tell."""
         asked = await json_body(request, Points)
         async with self._busy:
             return json_answer(await asyncio.to_thread(self._fit, asked))
@@ -164,7 +165,10 @@ class Aligner:
         }
 
     def _fit(self, asked: Points) -> dict[str, Any]:
-        found, _ = fit_points(self._base(), framing(self._loaded), asked)
+        try:
+            found, _ = fit_points(self._base(), framing(self._loaded), asked)
+        except GeometryError as error:  # an answer, too: what to measure
+            return {"refused": str(error)}
         return fit_json(found)
 
 

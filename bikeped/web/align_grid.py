@@ -22,7 +22,7 @@ METRE_LINES_M = 10.0
 REACH_M = RINGS_M[-1]
 _BEARINGS_DEG = tuple(range(-90, 91, 15))
 _FAR_M = 1e7  #: as good as infinitely far: the horizon
-_LABEL_BEARINGS_DEG = (0.0, -40.0, 40.0)
+_LABEL_BEARINGS_DEG = (-7.0, -45.0, 38.0)  #: beside the lines, not on them
 
 
 @dataclass(frozen=True)

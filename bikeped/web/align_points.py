@@ -90,7 +90,7 @@ class Points(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     marks: Annotated[list[Point], Meta(max_length=40)]
     between: Annotated[list[Between], Meta(max_length=80)] = []
     values: Values | None = None  #: where to start, and what is not fitted; None: as configured
-    free: Annotated[list[str], Meta(max_length=6)] = ["height_m", "pitch_deg"]
+    free: Annotated[tuple[str, ...], Meta(max_length=6)] = ("height_m", "pitch_deg")
     mark_px: Annotated[float, Meta(ge=0.05, le=100)] = 1.5  #: how well a mark is set, frame pixels
     tape_m: Annotated[float, Meta(ge=0.001, le=10)] = 0.02
 
@@ -146,7 +146,7 @@ def fit_points(camera: GroundCamera, framing: Framing, points: Points) -> tuple[
     ]
     accuracy = Accuracy(points.tape_m, points.mark_px * frame.scale)
     start = with_values(camera, points.values)
-    return fit(start, marks, spacings, tuple(points.free), accuracy), frame
+    return fit(start, marks, spacings, points.free, accuracy), frame
 
 
 def fit_json(found: Fit) -> dict[str, Any]:

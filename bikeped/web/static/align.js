@@ -1,0 +1,521 @@
+// The align page: numbers, marks, fit, save. What any of it means on the ground the box works out.
+
+import { $, announce, el, fixed, request, setText, toast } from "/static/ui.js";
+import { MarkList } from "/static/align-marks.js";
+import { KINDS, View } from "/static/align-view.js";
+
+const NAMES = {
+  height_m: ["Height", "m", 4],
+  pitch_deg: ["Pitch", "°", 3],
+  radius_px: ["Radius", "px", 2],
+  cx: ["Centre, across", "px", 2],
+  cy: ["Centre, down", "px", 2],
+  heading_deg: ["Heading", "°", 3],
+};
+const HINTS = {
+  height_m: "of the lens above the ground",
+  pitch_deg: "0 looks level, negative looks down",
+  radius_px: "of the lens circle, in pixels of the square crop",
+  heading_deg: "turns the grid to the right of where the camera looks",
+};
+const FIRST = ["height_m", "pitch_deg", "radius_px"];
+
+let box = null; // what /align/state said
+let values = {};
+let before = null; // the numbers before the last fit
+let coarse = false;
+let marks = [];
+let between = [];
+let chosen = null;
+const free = new Set(["height_m", "pitch_deg"]);
+const dials = new Map();
+
+const view = new View(
+  { stage: $("#stage"), canvas: $("#picture"), pins: $("#pins"), loupe: $("#loupe") },
+  {
+    tap: (u, v) => addMark(u, v),
+    moved: () => marksMoved(),
+    chosen: (mark) => choose(mark),
+    removed: (mark) => removeMark(mark),
+    entered: (mark) => list.focus(mark),
+  },
+);
+const list = new MarkList({
+  changed: () => marksMoved(),
+  chosen: (mark, show) => {
+    choose(mark);
+    if (show) {
+      view.reveal(mark);
+      view.focus(mark);
+    }
+  },
+  removed: (mark) => removeMark(mark),
+  betweenChanged: () => remember(),
+});
+
+const rounded = (key, value) => Number(value.toFixed(NAMES[key][2]));
+const minus = (text) => text.replace("-", "−");
+function sign(value, digits) {
+  const size = Math.abs(value).toFixed(digits);
+  return Number(size) === 0 ? size : `${value < 0 ? "−" : "+"}${size}`;
+}
+const unitOf = (key) => (NAMES[key][1] === "°" ? "°" : ` ${NAMES[key][1]}`);
+
+// --- numbers
+
+function makeDials() {
+  for (const field of box.fields) {
+    const [name, unit] = NAMES[field.key];
+    const id = `dial-${field.key}`;
+    const figure = el("input", { type: "number", id, step: "any", min: field.min, max: field.max, autocomplete: "off" });
+    const slider = el("input", { type: "range", min: field.from, max: field.to, step: field.step, "aria-label": `${name}, slider` });
+    const step = (way) => {
+      const size = coarse ? field.coarse : field.step;
+      set(field.key, Math.round(values[field.key] / size + way) * size);
+    };
+    figure.addEventListener("input", () => {
+      if (figure.value.trim() !== "" && figure.validity.valid) set(field.key, Number(figure.value), figure);
+    });
+    figure.addEventListener("change", () => showDial(field.key));
+    figure.addEventListener("keydown", (event) => {
+      const way = { ArrowUp: 1, ArrowDown: -1 }[event.key];
+      if (!way) return;
+      event.preventDefault();
+      step(way);
+    });
+    slider.addEventListener("input", () => set(field.key, Number(slider.value), slider));
+    const less = el("button", { type: "button", "aria-label": `${name}: less`, onclick: () => step(-1) }, el("span", { "aria-hidden": "true" }, "−"));
+    const more = el("button", { type: "button", "aria-label": `${name}: more`, onclick: () => step(1) }, el("span", { "aria-hidden": "true" }, "+"));
+    const effect = el("span", {});
+    const about = el("p", { class: "note", id: `${id}-note` }, HINTS[field.key] ? `${HINTS[field.key]}. ` : "",
+      FIRST.slice(0, 2).includes(field.key) || field.key === "heading_deg" ? "" : `From ${field.origin}. `, effect);
+    figure.setAttribute("aria-describedby", about.id);
+    const node = el("div", { class: "dial" },
+      el("div", { class: "head" }, el("label", { for: id }, name), el("span", { class: "figure" }, figure, el("span", { class: "unit" }, unit))),
+      less, slider, more, about);
+    $(FIRST.includes(field.key) ? "#dials" : "#more-dials").append(node);
+    dials.set(field.key, { figure, slider, effect });
+  }
+}
+
+function showDial(key, but = null) {
+  const { figure, slider } = dials.get(key);
+  const value = rounded(key, values[key]);
+  if (figure !== but) figure.value = value;
+  if (slider !== but) slider.value = value;
+  slider.setAttribute("aria-valuetext", `${value}${unitOf(key)}`);
+}
+
+function set(key, value, from = null) {
+  const field = box.fields.find((item) => item.key === key);
+  const lowest = key === "height_m" ? 0.05 : key === "radius_px" ? 1 : field.min;
+  values[key] = rounded(key, Math.min(Math.max(value, lowest), field.max));
+  showDial(key, from);
+  changed();
+}
+
+function setAll(next) {
+  values = { ...next };
+  for (const key of dials.keys()) showDial(key);
+  changed();
+}
+
+function changed() {
+  showChanges();
+  redraw();
+}
+
+// --- the grid: one question under way, the newest numbers next; an answer is never older than the
+// one before it, and one that was overtaken while a question waits is replaced at once
+
+let asking = false;
+let again = false;
+
+async function redraw() {
+  if (!view.size || !box) return;
+  if (asking) {
+    again = true;
+    return;
+  }
+  asking = true;
+  do {
+    again = false;
+    try {
+      const answer = await request("/align/grid", { json: { values, frame: view.size, marks: marks.map(asPoint) } });
+      trouble("");
+      view.setGrid(answer.grid, answer.at_10m && answer.at_10m.pixel);
+      showTen(answer.at_10m);
+      showReadings(answer.marks);
+    } catch (error) {
+      trouble(error.message);
+    }
+  } while (again);
+  asking = false;
+}
+
+function trouble(text) {
+  const place = $("#trouble");
+  setText(place, text);
+  place.hidden = !text;
+}
+
+function showTen(ten) {
+  const place = $("#ten-text");
+  for (const [key, { effect }] of dials) {
+    const moves = ten && ten.steps[key];
+    const known = typeof moves === "number";
+    const flat = known && Math.abs(moves) < 0.0005;
+    setText(effect, known
+      ? `${sign(ten.by[key], ten.by[key] < 1 ? 1 : 0)}${unitOf(key)} ${flat ? "leaves a 10 m mark where it is" : `moves a 10 m mark by ${sign(100 * moves, 0)} cm`}.`
+      : "");
+  }
+  if (!ten) return setText(place, "10 m is not in view.");
+  if (ten.reads_m === null) return place.replaceChildren("What read 10 m is ", el("b", {}, "above the horizon"), " now.");
+  const moved = ten.reads_m - ten.was_m;
+  place.replaceChildren("What read 10 m reads ", el("b", { id: "ten-figure" }, fixed(ten.reads_m, 2, " m")),
+    Math.abs(moved) < 0.005 ? "" : ` (${sign(moved, 2)} m)`);
+}
+
+// --- marks
+
+function asPoint(mark) {
+  return { name: mark.name, u: mark.u, v: mark.v, distance_m: mark.distance_m ?? null, right_m: mark.right_m ?? null };
+}
+
+function showReadings(readings) {
+  for (const reading of readings) {
+    const mark = marks.find((item) => item.name === reading.name);
+    if (!mark) continue;
+    mark.goal = reading.measured_at ?? null;
+    mark.off = !reading.on_ground;
+    if (!reading.on_ground) {
+      mark.says = "above the horizon: not on the ground";
+      mark.tag = `${mark.name}: above the horizon`;
+      continue;
+    }
+    const side = `${fixed(Math.abs(reading.right_m), 2, " m")} ${reading.right_m < 0 ? "left" : "right"}`;
+    mark.says = `reads ${fixed(reading.distance_m, 2, " m")}, ${side}`;
+    mark.tag = `${mark.name}: ${fixed(reading.distance_m, 2, " m")}`;
+    if (typeof mark.distance_m === "number") {
+      const off = reading.distance_m - mark.distance_m;
+      mark.says += `; ${sign(100 * off, 0)} cm`;
+      if (Number.isFinite(mark.right_m)) mark.says += `, to the side ${sign(100 * (reading.right_m - mark.right_m), 0)} cm`;
+    }
+  }
+  showMarks();
+}
+
+function showMarks() {
+  for (const mark of marks) mark.chosen = mark === chosen;
+  view.setMarks(marks);
+  list.show(marks);
+  showWants();
+}
+
+function addMark(u, v, more = {}) {
+  if (marks.length >= 40) return toast("40 marks are enough.", "bad");
+  let number = 1;
+  while (marks.some((mark) => mark.name === String(number))) number += 1;
+  const id = Math.max(0, ...marks.map((mark) => mark.id)) + 1;
+  const tenth = (value, most) => Math.round(Math.min(Math.max(value, 0), most) * 10) / 10;
+  const mark = {
+    id, name: more.name ?? String(number), distance_m: more.distance_m ?? null, right_m: more.right_m ?? null,
+    u: tenth(u, view.size.width - 1), v: tenth(v, view.size.height - 1),
+  };
+  marks.push(mark);
+  choose(mark);
+  list.showBetween(between, marks);
+  marksMoved();
+  if (!more.name) announce(`Mark ${mark.name} set. Its distance is asked for under Marks.`);
+  return mark;
+}
+
+function removeMark(mark) {
+  marks = marks.filter((item) => item !== mark);
+  between = between.filter((pair) => pair.first !== mark.id && pair.second !== mark.id);
+  if (chosen === mark) chosen = null;
+  list.showBetween(between, marks);
+  showMarks();
+  marksMoved();
+  announce(`Mark ${mark.name} deleted.`);
+  $("#stage").focus({ preventScroll: true });
+}
+
+function choose(mark) {
+  if (chosen === mark) return;
+  chosen = mark;
+  showMarks();
+}
+
+function marksMoved() {
+  remember();
+  showWants();
+  redraw();
+}
+
+function points() {
+  const measured = marks.filter((mark) => typeof mark.distance_m === "number" && mark.distance_m > 0);
+  const name = (id) => marks.find((mark) => mark.id === id)?.name;
+  const pairs = between.filter((pair) => pair.distance_m > 0 && pair.first !== pair.second
+    && [pair.first, pair.second].every((id) => measured.some((mark) => mark.id === id)));
+  return {
+    frame: view.size,
+    marks: measured.map(asPoint),
+    between: pairs.map((pair) => ({ first: name(pair.first), second: name(pair.second), distance_m: pair.distance_m })),
+    values,
+    free: Object.keys(NAMES).filter((key) => free.has(key)),
+  };
+}
+
+function showWants() {
+  const without = marks.filter((mark) => !(mark.distance_m > 0)).map((mark) => mark.name);
+  const wants = [];
+  if (without.length && marks.length) wants.push(`No distance yet, so left out: mark ${without.join(", ")}.`);
+  setText($("#fit-wants"), wants.join(" "));
+  $("#fit").disabled = without.length === marks.length || free.size === 0;
+}
+
+// Marks outlive a reload: a phone drops pages from its memory.
+const SHELF = "bikeped-align";
+
+function remember() {
+  try {
+    localStorage.setItem(SHELF, JSON.stringify({ size: view.size, marks: marks.map((mark) => ({ id: mark.id, ...asPoint(mark) })), between }));
+  } catch { /* not remembered, then */ }
+}
+
+function recall() {
+  try {
+    const kept = JSON.parse(localStorage.getItem(SHELF));
+    if (!kept || kept.size.width !== view.size.width || kept.size.height !== view.size.height) return;
+    marks = kept.marks.filter((mark) => Number.isFinite(mark.u) && Number.isFinite(mark.v));
+    between = kept.between ?? [];
+    list.showBetween(between, marks);
+    if (marks.length) toast(`${marks.length} mark${marks.length > 1 ? "s" : ""} from before.`);
+  } catch { marks = []; between = []; }
+}
+
+// --- fit
+
+async function fit() {
+  const button = $("#fit"), place = $("#fit-answer");
+  button.disabled = true;
+  try {
+    const answer = await request("/align/fit", { json: points() });
+    if (answer.refused) throw new Error(`${answer.refused[0].toUpperCase()}${answer.refused.slice(1)}.`);
+    before = { ...values };
+    $("#undo").hidden = false;
+    const next = Object.fromEntries(Object.entries(answer.values).map(([key, value]) => [key, rounded(key, value)]));
+    showFit(answer, next);
+    setAll(next);
+  } catch (error) {
+    place.replaceChildren(el("p", { class: "error" }, error.message));
+  } finally {
+    showWants();
+  }
+}
+
+function showFit(answer, next) {
+  const found = Object.entries(answer.error).map(([key, error]) => {
+    const digits = unitOf(key) === " px" ? 1 : 2;
+    return `${NAMES[key][0]} ${minus(fixed(next[key], digits))} ± ${fixed(error, digits)}${unitOf(key)}`;
+  });
+  const said = [el("p", { class: "verdict" }, `${found.join(", ")}.`)];
+  if (answer.at_10m_error_m !== null) said.push(el("p", {}, `What reads 10 m is 10 m ± ${fixed(100 * answer.at_10m_error_m, 0)} cm.`));
+  if (answer.spare_measurements === 0) said.push(el("p", { class: "warn" }, "No measurement is left over to check these numbers. Add a mark."));
+  if (answer.suspect) said.push(el("p", { class: "warn" }, `The others agree without mark ${answer.suspect}: set and measure it again.`));
+  else if (!answer.agrees) said.push(el("p", { class: "warn" }, "The marks do not agree with one another: set and measure them again."));
+  const rows = answer.residuals.map((row) => el("tr", {},
+    el("th", { scope: "row" }, row.mark), el("td", {}, { distance: "distance", right: "right", forward: "forward", spacing: "between" }[row.what]),
+    el("td", { class: "number" }, minus(fixed(row.measured_m, 2))), el("td", { class: "number" }, minus(fixed(row.read_m, 2))),
+    el("td", { class: "number" }, sign(100 * row.off_m, 1), row.strange ? el("span", { class: "bad-mark" }, "") : null)));
+  const head = ["Mark", "What", "Tape, m", "Reads, m", "Off, cm"].map((text, i) => el("th", { scope: "col", class: i > 1 ? "number" : null }, text));
+  said.push(el("div", { class: "scroll" }, el("table", {}, el("caption", { class: "unseen" }, "What is left over"), el("thead", {}, el("tr", {}, head)), el("tbody", {}, rows))));
+  $("#fit-answer").replaceChildren(...said);
+}
+
+// --- save
+
+function differing() {
+  return Object.keys(NAMES).filter((key) => key in values
+    && Math.abs(values[key] - rounded(key, box.filed[key])) > 0.5 * 10 ** -NAMES[key][2]);
+}
+
+function showChanges() {
+  const keys = differing();
+  $("#changes tbody").replaceChildren(...keys.map((key) => el("tr", {},
+    el("th", { scope: "row" }, `camera.${key}`),
+    el("td", { class: "number" }, `${rounded(key, box.filed[key])}`), el("td", { class: "number" }, el("b", {}, `${values[key]}`)))));
+  $("#changes").hidden = keys.length === 0;
+  $("#no-changes").hidden = keys.length > 0;
+  $("#save").disabled = keys.length === 0 || box.cannot_save !== null;
+  $("#by-hand").hidden = keys.length === 0;
+  $("#by-hand").open = box.cannot_save !== null;
+  setText($("#yaml"), `camera:\n${keys.map((key) => `  ${key}: ${values[key]}\n`).join("")}`);
+}
+
+function showFile() {
+  setText($("#file"), box.source.split("/").pop());
+  const place = $("#save-why");
+  const differs = Object.keys(NAMES).some((key) => Math.abs(box.running[key] - box.filed[key]) > 1e-3);
+  const why = box.cannot_save ?? (differs && box.live ? "The running service still has other numbers than the file: it reads the file when it starts." : differs ? "--set gives other numbers than the file has." : "");
+  setText(place, why);
+  place.hidden = !why;
+}
+
+async function save() {
+  const button = $("#save"), place = $("#saved");
+  button.disabled = true;
+  try {
+    const answer = await request("/align/save", { json: { values: Object.fromEntries(differing().map((key) => [key, values[key]])), sha256: box.sha256 } });
+    box = await request("/align/state");
+    showFile();
+    place.replaceChildren(
+      el("p", { class: "verdict ok-mark" }, `Saved into ${answer.config}.`),
+      el("p", { class: "note" }, "The file before: ", el("code", {}, answer.backup.split("/").pop()), "."),
+      answer.restart ? el("p", {}, "The service takes it when it starts anew: ", el("code", {}, "sudo systemctl restart bikeped")) : null,
+      answer.promoted ? el("p", { class: "warn" }, "The promoted decision was measured with the camera as it was: run ", el("code", {}, "bikeped conformance gate"), " again.") : null);
+  } catch (error) {
+    place.replaceChildren(el("p", { class: "error" }, error.message),
+      error.status === 409 ? el("button", { type: "button", onclick: () => location.reload() }, "Open the page again") : null);
+  }
+  showChanges();
+}
+
+// --- the rest
+
+function adding(on) {
+  view.adding = on;
+  $("#add").setAttribute("aria-pressed", String(on));
+  for (const id of ["#here", "#hint", "#cross"]) $(id).hidden = !on;
+  $("#stage").classList.toggle("adding", on);
+}
+
+async function newPicture() {
+  const blank = $("#blank");
+  try {
+    const answer = await fetch("/align/frame.jpg");
+    if (!answer.ok) throw new Error((await answer.json()).error);
+    await view.setPicture(await answer.blob());
+    blank.hidden = true;
+  } catch (error) {
+    setText(blank, error.message);
+    blank.hidden = Boolean(view.size);
+    if (view.size) toast(error.message, "bad");
+  }
+}
+
+function exportMarks() {
+  const text = `${JSON.stringify(points(), null, 2)}\n`;
+  const link = el("a", { href: URL.createObjectURL(new Blob([text], { type: "application/json" })), download: "points.json" });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+async function importMarks(file) {
+  try {
+    const data = JSON.parse(await file.text());
+    const share = view.size.width / data.frame.width;
+    if (Math.abs(view.size.height / data.frame.height - share) > 0.01) throw new Error("it is for pictures of other proportions");
+    marks = [];
+    between = [];
+    for (const mark of data.marks.slice(0, 40)) addMark(mark.u * share, mark.v * share, { ...mark, name: String(mark.name) });
+    const id = (name) => marks.find((mark) => mark.name === name)?.id;
+    between = (data.between ?? []).map((pair) => ({ first: id(pair.first), second: id(pair.second), distance_m: pair.distance_m })).filter((pair) => pair.first && pair.second);
+    list.showBetween(between, marks);
+    marksMoved();
+  } catch (error) {
+    toast(`${file.name}: cannot be read as marks (${error.message})`, "bad");
+  }
+}
+
+function listen() {
+  $("#add").addEventListener("click", () => adding(!view.adding));
+  $("#here").addEventListener("click", () => addMark(...view.middle()));
+  $("#in").addEventListener("click", () => view.zoom(1.5));
+  $("#out").addEventListener("click", () => view.zoom(1 / 1.5));
+  $("#all").addEventListener("click", () => view.show(view.contain()));
+  $("#renew").addEventListener("click", newPicture);
+  const steps = (big) => {
+    coarse = big;
+    $("#fine").setAttribute("aria-pressed", String(!big));
+    $("#coarse").setAttribute("aria-pressed", String(big));
+    for (const field of box.fields) dials.get(field.key).slider.step = big ? field.coarse : field.step;
+    for (const key of dials.keys()) showDial(key);
+  };
+  $("#fine").addEventListener("click", () => steps(false));
+  $("#coarse").addEventListener("click", () => steps(true));
+  $("#back").addEventListener("click", () => setAll(box.filed));
+  $("#fit").addEventListener("click", fit);
+  $("#undo").addEventListener("click", () => {
+    if (before) setAll(before);
+    $("#undo").hidden = true;
+    $("#fit-answer").replaceChildren();
+    $("#fit").focus();
+  });
+  $("#save").addEventListener("click", save);
+  $("#export").addEventListener("click", exportMarks);
+  $("#import").addEventListener("click", () => $("#import-file").click());
+  $("#import-file").addEventListener("change", (event) => {
+    if (event.target.files[0]) importMarks(event.target.files[0]);
+    event.target.value = "";
+  });
+  $("#clear").addEventListener("click", () => {
+    marks = [];
+    between = [];
+    chosen = null;
+    list.showBetween(between, marks);
+    showMarks();
+    marksMoved();
+  });
+  $("#add-between").addEventListener("click", () => {
+    between.push({ first: marks[0].id, second: marks[marks.length - 1].id, distance_m: null });
+    list.showBetween(between, marks);
+  });
+}
+
+function makeChoices() {
+  for (const [kind, { label, colour }] of Object.entries(KINDS)) {
+    const swatch = el("span", { class: "swatch", "aria-hidden": "true" });
+    swatch.style.background = colour;
+    const check = el("input", { type: "checkbox", checked: true });
+    check.addEventListener("change", () => {
+      view.hidden[check.checked ? "delete" : "add"](kind);
+      view.repaint();
+    });
+    $("#kinds").append(el("label", { class: "check" }, check, swatch, label));
+  }
+  for (const key of Object.keys(NAMES)) {
+    const check = el("input", { type: "checkbox", checked: free.has(key), value: key });
+    check.addEventListener("change", () => {
+      free[check.checked ? "add" : "delete"](key);
+      showWants();
+    });
+    $("#free").append(el("label", { class: "check" }, check, NAMES[key][0]));
+  }
+}
+
+async function open() {
+  try {
+    box = await request("/align/state");
+  } catch (error) {
+    trouble(error.message);
+    return;
+  }
+  values = { ...box.start };
+  for (const key of Object.keys(values)) values[key] = rounded(key, values[key]);
+  makeDials();
+  makeChoices();
+  for (const key of dials.keys()) showDial(key);
+  $("#renew").hidden = !box.live;
+  showFile();
+  showChanges();
+  listen();
+  await newPicture();
+  if (view.size) recall();
+  showMarks();
+  redraw();
+  document.documentElement.dataset.ready = "align";
+}
+
+open();
