@@ -66,8 +66,8 @@ def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
     image[~ray.lit] = 0
     standing = []
     for thing in where.fixtures:
-        mesh = fixture(thing)
         away = float(np.hypot(*(np.array(thing.xy_m) - view.eye_m[:2])))
+        mesh = fixture(thing, away)
         local = _lamplight(where, light, np.array(thing.xy_m))
         sprite = rasterise(mesh, view, light, local=local, away_m=away)
         if sprite is not None:
@@ -155,7 +155,8 @@ def _ground(
                 tile, (x * 24) % 512, (y * 24) % 512, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
             )
         )
-        shine = np.clip(shine * (0.75 + 0.3 * patch), 0, 0.9)[..., None]
+        patch = patch * np.clip(1.5 / deep, 0, 1)
+        shine = np.clip(shine * (0.75 + 0.3 * patch), 0, 0.85)[..., None]
         out += shine * (light.sky_low.astype(np.float32) * 0.9 - out)
     haze = (1 - np.exp(-np.maximum(away - 15, 0) / light.haze_m))[..., None]
     out += haze * (light.sky_low.astype(np.float32) - out)
@@ -190,7 +191,7 @@ def _lamplight(where: Place, light: Lighting, xy_m: FloatArray) -> FloatArray | 
 def _lamp_pools(where: Place, xy: Float32Array) -> Float32Array:
     """Light of the street lamps at ground positions [..., 2] as factors [..., 3]."""
     out = np.zeros((*xy.shape[:-1], 3), np.float32)
-    colour = np.array([0.72, 0.58, 0.38], np.float32)
+    colour = np.array([0.98, 0.80, 0.54], np.float32)
     reach, high = LAMP_HEAD_M
     for item in where.fixtures:
         if item.what != "lamp":
@@ -223,7 +224,7 @@ def _draw_far(image: ImageArray, mesh: Mesh, view: SceneCamera, light: Lighting)
     kept = facing[seen]
     away = np.linalg.norm(middle[kept] - view.eye_m, axis=1)
     haze = (1 - np.exp(-np.maximum(away - 15, 0) / light.haze_m))[:, None]
-    colour = shaded(mesh, normal, kept, light, np.array([0.12, 0.1, 0.07]) if light.lamps else None)
+    colour = shaded(mesh, normal, kept, light, np.array([0.2, 0.17, 0.12]) if light.lamps else None)
     colour += haze * (light.sky_low - colour)
     fixed = np.round((pixels[seen] - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)).astype(np.int32)
     for i in np.argsort(mesh.layer[kept], kind="stable"):

@@ -19,7 +19,7 @@ def random_scenario(seed: int) -> Scenario:
     """A scenario of 6 s: walkers, children, wheelchairs, cyclists, e-scooters and vehicles, none to
     a crowd, 1.5 to 40 m before the usual camera, in all directions, some standing still."""
     rng = np.random.default_rng((seed, 41))
-    busy = float(rng.choice([0.25, 1.0, 2.0]))
+    busy = float(rng.choice([0.3, 1.0, 1.8]))
     agents: list[Agent] = []
     taken: list[tuple[float, float, float]] = []
 
@@ -49,7 +49,7 @@ def random_scenario(seed: int) -> Scenario:
         s = 1 + float(np.clip(rng.normal(0, part / 2), -part, part))
         return length * s, width * s, height * s
 
-    for _ in range(int(rng.poisson(2.2 * busy))):
+    for _ in range(int(rng.poisson(3.4 * busy))):
         draw = rng.random()
         size = varied("pedestrian")
         if draw < 0.15:
@@ -59,7 +59,7 @@ def random_scenario(seed: int) -> Scenario:
             size = (1.1, 0.65, 1.3)
         speed = 0.0 if rng.random() < 0.3 else float(rng.uniform(0.6, 1.8))
         add("pedestrian", size, speed, 0.8 if rng.random() < 0.25 else 0.0)
-    for _ in range(int(rng.poisson(1.8 * busy))):
+    for _ in range(int(rng.poisson(2.6 * busy))):
         size = varied("cyclist", 0.05) if rng.random() < 0.75 else (1.2, 0.5, 1.75)
         speed = 0.0 if rng.random() < 0.12 else float(rng.uniform(2.0, 9.0))
         add("cyclist", size, speed, 1.2 if rng.random() < 0.15 else 0.0)
@@ -105,8 +105,8 @@ def random_camera(
     rng = np.random.default_rng((seed, 67))
     height_m = float(rng.uniform(2.6, 5.5))
     pose = CameraPose(
-        DEFAULT_POSE.x_m,
-        DEFAULT_POSE.y_m,
+        DEFAULT_POSE.x_m + float(rng.uniform(-2.5, 2.5)),
+        DEFAULT_POSE.y_m + float(rng.uniform(-1.5, 1.0)),
         DEFAULT_POSE.heading_deg + float(rng.uniform(-12, 12)),
     )
     if lens == "rectilinear":

@@ -98,7 +98,7 @@ def lighting(conditions: Conditions) -> Lighting:
         top, low = np.array([72.0, 92, 142]), np.array([222.0, 166, 122])
         noise *= 1.5
     elif kind == "night":
-        sun, ambient = np.zeros(3), np.array([0.10, 0.11, 0.15])
+        sun, ambient = np.zeros(3), np.array([0.15, 0.16, 0.21]) * float(rng.uniform(0.75, 1.6))
         top, low, clouds, haze = np.array([10.0, 12, 22]), np.array([38.0, 34, 38]), 0.15, 300.0
         noise *= 2.4
     elif kind == "glare":

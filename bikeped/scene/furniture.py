@@ -15,13 +15,18 @@ _STEEL: Rgb = (96, 100, 106)
 LAMP_HEAD_M = (1.6, 5.9)  #: how far over the road and how high a street lamp shines
 
 
-def fixture(item: Fixture) -> Mesh:
-    """The mesh of a fixture, in the world."""
+#: Length and width of what stands on the ground.
+FEET_M: dict[str, tuple[float, float]] = {"car": (4.5, 1.8), "bin": (0.5, 0.5), "tree": (0.5, 0.5)}
+POLE_FOOT_M = (0.2, 0.2)
+
+
+def fixture(item: Fixture, away_m: float) -> Mesh:
+    """The mesh of a fixture, in the world; a near tree has more and smaller leaves."""
     rng = np.random.default_rng(item.number)
     if item.what == "car":
         mesh = vehicle("car", SIZES_M["car"], item.number)
     elif item.what == "tree":
-        mesh = _tree(rng)
+        mesh = _tree(rng, 1600 if away_m < 12 else 420)
     else:
         b = Builder()
         {"lamp": _lamp, "sign": _sign, "signal": _signal, "bin": _bin, "hydrant": _hydrant,
@@ -46,7 +51,7 @@ def _sign(b: Builder, rng: np.random.Generator) -> None:
         rim = np.stack([np.full(len(turn), x), r * np.cos(turn), 2.3 + r * np.sin(turn)], axis=1)
         middle = np.broadcast_to(np.array([x, 0, 2.3]), rim.shape)
         plate = np.stack([middle, rim, np.roll(rim, -1, axis=0), middle], axis=1)
-        b.faces(plate, shade, layer=1)
+        b.faces(plate, shade, layer=1 if r > 0.3 else 2)
         if r > 0.3:
             b.faces(plate[:, ::-1] * (-1, 1, 1), (120, 122, 126), layer=1)
 
@@ -89,7 +94,7 @@ def _bollard(b: Builder, rng: np.random.Generator) -> None:
     b.limb((0, 0, tall - 0.16), (0, 0, tall - 0.1), 0.07, 0.07, (225, 225, 220), 1)
 
 
-def _tree(rng: np.random.Generator) -> Mesh:
+def _tree(rng: np.random.Generator, count: int) -> Mesh:
     """A trunk and a crown of leaves: small faces turned every way about a few lobes."""
     b = Builder(sides=7)
     tall = float(rng.uniform(4.6, 7.2))
@@ -100,10 +105,9 @@ def _tree(rng: np.random.Generator) -> Mesh:
     lobes = rng.normal(0, 0.5, (7, 3)) * (wide, wide, 0.8) + (0, 0, tall * 0.76)
     for lobe in lobes:
         b.limb((0.1, 0.05, tall * 0.48), tuple(lobe), 0.08, 0.03, bark)
-    count = 420
     middle = lobes[rng.integers(0, 7, count)] + rng.normal(0, 0.42, (count, 3)) * (wide, wide, 1.0)
     middle[:, 2] = np.maximum(middle[:, 2], 2.2)
-    size = rng.uniform(0.16, 0.36, count)[:, None]
+    size = rng.uniform(0.16, 0.36, count)[:, None] * (420 / count) ** 0.55
     u = rng.normal(0, 1, (count, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     v = np.cross(u, rng.normal(0, 1, (count, 3)))

@@ -11,6 +11,7 @@ from bikeped.conformance.scenario import Agent, Scenario
 from bikeped.scene.backdrop import Standing, backdrop
 from bikeped.scene.camera import SceneCamera
 from bikeped.scene.conditions import Conditions
+from bikeped.scene.furniture import FEET_M, POLE_FOOT_M
 from bikeped.scene.labels import Candidate, DrawnObject, label
 from bikeped.scene.mesh import Mesh
 from bikeped.scene.paste import darken, footprint, paste, shine
@@ -141,7 +142,7 @@ class ScenePainter:
         """The street with everything that stands on it; `standing` far ones first."""
         image = self.backdrop.image.copy()
         for item in standing:
-            size = (4.5, 1.8) if item.item.what == "car" else (0.5, 0.5)
+            size = FEET_M.get(item.item.what, POLE_FOOT_M)
             self._shade(image, item.mesh, np.array(item.item.xy_m), size, item.item.heading_rad)
         for item in standing:
             paste(image, self.backdrop, item.sprite)

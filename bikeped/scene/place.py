@@ -1,7 +1,7 @@
 """Where the street lies and what stands along it: a place by its number. Pure.
 
-The road runs along the world's x axis with a crosswalk at x = 5 and a side street to the west, as
-the bundled scenarios have it; widths, markings, colours, houses and furniture vary by place.
+The road runs along the world's x axis; place 0 has a crosswalk at x = 5 and a side street to the
+west, as the bundled scenarios have it. Widths, markings, colours, houses and furniture vary.
 """
 
 from __future__ import annotations
@@ -75,9 +75,11 @@ def place(number: int) -> Place:
     walk = 4.0 if usual else float(rng.uniform(2.6, 5.0))
     side = (-7.6, -1.2) if usual or rng.random() < 0.6 else None
     if side is not None and not usual:
-        middle, half = float(rng.uniform(-16, -4)), float(rng.uniform(2.8, 4.2))
+        middle, half = float(rng.uniform(-18, -6)), float(rng.uniform(2.8, 4.2))
+        middle = middle if rng.random() < 0.6 else 10 - middle
         side = (middle - half, middle + half)
     half_walk = 1.7 if usual else float(rng.uniform(1.3, 2.2))
+    cross = CROSSING_X_M + (0.0 if usual else float(rng.uniform(-6, 6)))
     grey = float(rng.uniform(-16, 14)) if not usual else 0.0
     asphalt = (98 + grey, 100 + grey, 104 + grey)
     paving = (
@@ -97,7 +99,7 @@ def place(number: int) -> Place:
         kerb=kerb,
         walk=walk,
         side_street=side,
-        crosswalk=(CROSSING_X_M - half_walk, CROSSING_X_M + half_walk),
+        crosswalk=(cross - half_walk, cross + half_walk),
         crosswalk_style="bars" if usual else str(rng.choice(["bars", "ladder", "lines", "worn"])),
         bike_lanes=usual or bool(rng.random() < 0.7),
         green_lanes=usual or bool(rng.random() < 0.4),
@@ -108,7 +110,7 @@ def place(number: int) -> Place:
         slab_m=0.9 if usual else float(rng.choice([0.5, 0.75, 1.2, 1.5])),
         yellow_centre=usual or bool(rng.random() < 0.5),
         houses=_houses(rng, kerb + walk, side),
-        fixtures=_fixtures(rng, usual, kerb, walk, side),
+        fixtures=_fixtures(rng, usual, kerb, walk, side, cross),
     )
 
 
@@ -148,6 +150,7 @@ def _fixtures(
     kerb: float,
     walk: float,
     side: tuple[float, float] | None,
+    cross: float,
 ) -> tuple[Fixture, ...]:
     """Lamps, trees, signs, bins and parked cars; more of them in some places than in others."""
     out: list[Fixture] = []
@@ -162,13 +165,15 @@ def _fixtures(
     trees = 9.0 if usual else float(rng.uniform(6, 26))
     for x in np.arange(-60, 70, trees).tolist():
         x += float(rng.uniform(-1.5, 1.5)) + 2.0
-        if abs(x - CROSSING_X_M) > 3.2:
+        if abs(x - cross) > 3.2:
             put("tree", x, kerb + walk - 0.5)
-    put("signal", CROSSING_X_M + 2.9, kerb + 0.5, -np.pi / 2)
-    put("signal", CROSSING_X_M - 2.9, -kerb - 0.5, np.pi / 2)
+    put("signal", cross + 2.9, kerb + 0.5, -np.pi / 2)
+    if usual or rng.random() < 0.6:
+        put("signal", cross - 2.9, -kerb - 0.5, np.pi / 2)
     put("bin", float(rng.uniform(8, 14)), kerb + walk - 0.4)
     put("hydrant", float(rng.uniform(9, 16)), kerb + 0.5)
-    put("sign", float(rng.uniform(8.5, 12)), -kerb - 0.5, np.pi)
+    if usual or rng.random() < 0.6:
+        put("sign", cross + float(rng.uniform(3.5, 9)), -kerb - 0.5, np.pi)
     parked = [(14.0, 1), (20.5, 1), (-14.5, 1)] if usual else []
     if not usual:
         for way in (1, -1):
@@ -176,7 +181,7 @@ def _fixtures(
                 parked += [
                     (float(x) + float(rng.uniform(-0.6, 0.6)), way)
                     for x in np.arange(-38, 45, 6.4)
-                    if rng.random() < 0.5 and abs(float(x) - CROSSING_X_M) > 6
+                    if rng.random() < 0.5 and abs(float(x) - cross) > 6
                 ]
         for _ in range(int(rng.integers(0, 4))):  # street furniture close to the camera
             what = str(rng.choice(["bollard", "sign", "bin", "tree", "lamp"]))
