@@ -161,7 +161,9 @@ def tables(result: Evaluation) -> list[Table]:
             for index, (name, _) in enumerate(rows[0])
         ],
     )
-    found = [main, sizes]
+    found = [main, sizes, _alarms(result)]
+    if any(row for score in result.scores for row in score.by_distance.values()):
+        found.append(_distances(result))
     if all(score.classes is not None for score in result.scores):
         by_class = [
             [(row.name, row) for row in score.classes.rows if row.objects]
@@ -171,6 +173,42 @@ def tables(result: Evaluation) -> list[Table]:
         if len(by_class[0]) > 1:
             found.append(Table("classes", "by class", *_compared(result, by_class)))
     return found
+
+
+def _alarms(result: Evaluation) -> Table:
+    """False alarms of what is deployed."""
+    from bikeped.conformance.tables import Table
+    from bikeped.training.evaluate import KIND_NAMES
+
+    pictures = result.data["images"]
+    return Table(
+        "false",
+        "as deployed: false boxes per 100 pictures (IoU below 0.50 with anything)",
+        ("", *KIND_NAMES),
+        [
+            (score.label, *(round(100 * count / pictures, 2) for count in score.road_users.false))
+            for score in result.scores
+        ],
+    )
+
+
+def _distances(result: Evaluation) -> Table:
+    """Recall against distance, where the data tell it."""
+    from bikeped.conformance.tables import Table
+
+    first = result.scores[0].by_distance
+    lines: list[tuple[Cell, ...]] = []
+    for kind, rows in first.items():
+        for index, row in enumerate(rows):
+            end = "" if row["to_m"] is None else f"{row['to_m']:g}"
+            own = [_three(s.by_distance[kind][index]["recall50"]) for s in result.scores]
+            lines.append((kind, f"{row['from_m']:g} to {end}".strip(), row["objects"], *own))
+    return Table(
+        "distance",
+        "as deployed: recall at IoU 0.50 by distance",
+        ("", "distance, m", "objects", *(score.label for score in result.scores)),
+        lines,
+    )
 
 
 def _compared(

@@ -49,7 +49,8 @@ class CocoObject:
     """One annotation: `box_px` x1, y1, x2, y2, within the picture; `crowd` stands for many.
 
     `polygons` are the outlines [n, 2] of its segmentation in picture pixels, empty where it has
-    none or a run-length mask.
+    none or a run-length mask. `distance_m` from the camera's foot is bikeped's own addition: drawn
+    pictures have it.
     """
 
     id: int
@@ -58,6 +59,7 @@ class CocoObject:
     box_px: tuple[float, float, float, float]
     crowd: bool = False
     polygons: tuple[FloatArray, ...] = field(repr=False, default=(), compare=False)
+    distance_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ class _Annotation(msgspec.Struct):
     bbox: tuple[float, float, float, float]
     iscrowd: int | bool = 0
     segmentation: Any = None
+    distance_m: float | None = None
 
 
 class _Category(msgspec.Struct):
@@ -310,6 +313,7 @@ def _objects(
                 box,
                 bool(entry.iscrowd),
                 _polygons(where, entry.segmentation),
+                entry.distance_m,
             )
         )
     ordered = {

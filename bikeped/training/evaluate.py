@@ -35,26 +35,29 @@ from bikeped.detection import load_detector
 from bikeped.detection.layouts import Candidates
 from bikeped.detection.nms import suppress
 from bikeped.detection.pipeline import NetworkDetector
-from bikeped.detection.riders import join_riders
 from bikeped.errors import DataSetError
 from bikeped.files import write_whole
-from bikeped.training.coco import CocoData, CocoObject, read_picture
+from bikeped.training.coco import CocoData, read_picture
 from bikeped.training.measures import (
     Curve,
     Found,
     Measures,
     Truth,
     measure,
+    recall_by_distance,
     recall_curve,
     require_pycocotools,
 )
+from bikeped.training.truths import (
+    INPUT_PX,
+    joined_truth,
+    kinds_by_name,
+    plain_name,
+    truth_of,
+)
 from bikeped.types import Detections, Kind
 
-#: Side of the network input that areas are measured at (definitions, section 3).
-INPUT_PX = 1280
 KIND_NAMES = tuple(kind.label for kind in Kind)
-#: Classes whose box holds the cycle alone; any other cyclist's box holds the rider, too.
-BARE_CYCLES = frozenset({"bicycle", "motorcycle"})
 _MOST_OF_A_PICTURE = 300  # more than the measures read
 
 
@@ -87,6 +90,7 @@ class Scores:
     road_users: Measures
     curve: Curve
     curves: dict[str, Curve]  #: the same by kind
+    by_distance: dict[str, list[dict[str, Any]]]  #: of road users, by kind
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,11 @@ class Evaluation:
                             ("road_users", score.road_users),
                         )
                     },
+                    "false_per_100_pictures": {
+                        name: 100 * count / self.data["images"]
+                        for name, count in zip(KIND_NAMES, score.road_users.false, strict=True)
+                    },
+                    "recall_by_distance": score.by_distance,
                     "recall_curve": {
                         "all": score.curve.as_dict(),
                         **{name: curve.as_dict() for name, curve in score.curves.items()},
@@ -165,7 +174,7 @@ def evaluate(
     """
     require_pycocotools()
     settings = settings or EvaluationSettings()
-    kind_of = _kinds(data.categories, detection)
+    kind_of = kinds_by_name(data.categories, detection)
     if not kind_of or not any(
         thing.category_id in kind_of and not thing.crowd
         for found in data.objects.values()
@@ -176,8 +185,8 @@ def evaluate(
             "detection.pedestrian, detection.cyclist and detection.vehicle; name its categories "
             "there"
         )
-    known = [{_plain(name) for name in model.detector.class_names} for model in models]
-    shared = [i for i, name in data.categories.items() if all(_plain(name) in k for k in known)]
+    known = [{plain_name(name) for name in model.detector.class_names} for model in models]
+    shared = [i for i, name in data.categories.items() if all(plain_name(name) in k for k in known)]
     gathered = [_Gathered(model, data, shared, detection, settings) for model in models]
     for done, image in enumerate(data.images):
         picture = read_picture(image)
@@ -189,9 +198,9 @@ def evaluate(
             its.add(done, users, every, scale)
         progress(done + 1)
     truths = (
-        _truth(data, {category: n for n, category in enumerate(shared)}),
-        _truth(data, {category: int(kind) for category, kind in kind_of.items()}),
-        _joined_truth(data, kind_of, detection),
+        truth_of(data, {category: n for n, category in enumerate(shared)}),
+        truth_of(data, {category: int(kind) for category, kind in kind_of.items()}),
+        joined_truth(data, kind_of, detection),
     )
     names = [data.categories[category] for category in shared]
     return Evaluation(
@@ -254,9 +263,9 @@ class _Gathered:
         self._model = model
         self._iou = settings.iou
         names = model.detector.class_names
-        place = {_plain(data.categories[category]): n for n, category in enumerate(shared)}
-        kinds = _kinds(dict(enumerate(names)), detection)
-        self._class_of = np.array([place.get(_plain(name), -1) for name in names], np.int64)
+        place = {plain_name(data.categories[category]): n for n, category in enumerate(shared)}
+        kinds = kinds_by_name(dict(enumerate(names)), detection)
+        self._class_of = np.array([place.get(plain_name(name), -1) for name in names], np.int64)
         self._kind_of = np.array([int(kinds.get(n, -1)) for n in range(len(names))], np.int64)
         self._parts: tuple[list[_Part], ...] = ([], [], [])
 
@@ -298,6 +307,7 @@ class _Gathered:
                 kind.label: recall_curve(truths[2], users.hits, settings.least_objects, int(kind))
                 for kind in Kind
             },
+            {kind.label: recall_by_distance(truths[2], users.hits, int(kind)) for kind in Kind},
         )
 
 
@@ -317,81 +327,3 @@ def _all_of(parts: Sequence[_Part]) -> Found:
         np.concatenate([p.box_px for p in parts] or [np.zeros((0, 4))]).astype(np.float64),
         np.concatenate([p.score for p in parts] or none).astype(np.float32),
     )
-
-
-def _kinds(names: dict[int, str] | Any, detection: DetectionConfig) -> dict[int, Kind]:
-    """Which of the named classes are which kind of road user."""
-    wanted = {
-        _plain(name): kind
-        for kind, given in (
-            (Kind.PEDESTRIAN, detection.pedestrian),
-            (Kind.CYCLIST, detection.cyclist),
-            (Kind.VEHICLE, detection.vehicle),
-        )
-        for name in given
-    }
-    return {i: wanted[_plain(name)] for i, name in names.items() if _plain(name) in wanted}
-
-
-def _truth(data: CocoData, group_of: dict[int, int]) -> Truth:
-    """The data's boxes, their categories mapped by `group_of`; others are left out."""
-    image, group, box, crowd = [], [], [], []
-    for number, picture in enumerate(data.images):
-        scale = INPUT_PX / max(picture.width, picture.height)
-        for thing in data.objects[picture.id]:
-            if thing.category_id in group_of:
-                image.append(number)
-                group.append(group_of[thing.category_id])
-                box.append(np.multiply(thing.box_px, scale))
-                crowd.append(thing.crowd)
-    return _as_truth(image, group, box, crowd)
-
-
-def _joined_truth(data: CocoData, kind_of: dict[int, Kind], detection: DetectionConfig) -> Truth:
-    """The data's road users as the deployed detector means them: riders joined to their cycles."""
-    image, group, box, crowd = [], [], [], []
-    for number, picture in enumerate(data.images):
-        scale = INPUT_PX / max(picture.width, picture.height)
-        things = [t for t in data.objects[picture.id] if t.category_id in kind_of]
-        apart = [t for t in things if t.crowd or not _may_join(t, data, kind_of)]
-        parts = [t for t in things if not t.crowd and _may_join(t, data, kind_of)]
-        joined = join_riders(
-            Detections(
-                np.array([kind_of[t.category_id] for t in parts], np.int8),
-                np.ones(len(parts), np.float32),
-                np.array([t.box_px for t in parts], np.float32).reshape(-1, 4),
-            ),
-            detection.rider_overlap,
-            detection.confidence,
-        )
-        for kind, place in zip(joined.kind.tolist(), joined.box_px, strict=True):
-            image.append(number)
-            group.append(kind)
-            box.append(place.astype(np.float64) * scale)
-            crowd.append(False)
-        for thing in apart:
-            image.append(number)
-            group.append(int(kind_of[thing.category_id]))
-            box.append(np.multiply(thing.box_px, scale))
-            crowd.append(thing.crowd)
-    return _as_truth(image, group, box, crowd)
-
-
-def _may_join(thing: CocoObject, data: CocoData, kind_of: dict[int, Kind]) -> bool:
-    """People, and cycles whose box does not hold the rider already."""
-    if kind_of[thing.category_id] is Kind.CYCLIST:
-        return _plain(data.categories[thing.category_id]) in BARE_CYCLES
-    return kind_of[thing.category_id] is Kind.PEDESTRIAN
-
-
-def _as_truth(image: list[int], group: list[int], box: list[Any], crowd: list[bool]) -> Truth:
-    return Truth(
-        np.array(image, np.int64),
-        np.array(group, np.int64),
-        np.array(box, np.float64).reshape(-1, 4),
-        np.array(crowd, np.bool_),
-    )
-
-
-def _plain(name: str) -> str:
-    return name.strip().lower()

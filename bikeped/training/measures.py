@@ -24,17 +24,23 @@ MOST_BOXES = 100  #: of one picture and class, as COCO has it
 BIN_EDGES_PX2: tuple[float, ...] = tuple(
     float(side) ** 2 for side in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 512)
 )
+#: Edges of the bins of recall against distance, metres.
+DISTANCE_EDGES_M: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 _HUGE = 1e10
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Objects of all pictures: `image` [n], `category` [n] from 0, `box_px` [n, 4], `crowd` [n]."""
+    """Objects of all pictures: `image` [n], `category` [n] from 0, `box_px` [n, 4], `crowd` [n].
+
+    `distance_m` [n] is NaN where it is not known.
+    """
 
     image: IntArray
     category: IntArray
     box_px: FloatArray
     crowd: BoolArray
+    distance_m: FloatArray
 
     @property
     def area_px2(self) -> FloatArray:
@@ -84,12 +90,14 @@ class Row:
 class Measures:
     """`rows` a class, `overall` the mean over classes that have objects.
 
-    `hits` [n, 10]: whether each object of the truth was found, at IoU 0.50 ... 0.95.
+    `hits` [n, 10]: whether each object of the truth was found, at IoU 0.50 ... 0.95. `false` counts
+    the answers of each class that are no object and no crowd at IoU 0.50.
     """
 
     rows: tuple[Row, ...]
     overall: Row
     hits: BoolArray
+    false: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -138,7 +146,8 @@ def measure(truth: Truth, found: Found, names: Sequence[str], images: int) -> Me
                 (sizes[0], sizes[1], sizes[2]),
             )
         )
-    return Measures(tuple(rows), _overall(rows), _hits(evaluation, len(truth.image)))
+    hits, false = _hits(evaluation, len(truth.image), len(names))
+    return Measures(tuple(rows), _overall(rows), hits, false)
 
 
 def recall_curve(
@@ -169,6 +178,30 @@ def recall_curve(
         tuple(float(hit[group, 0].mean()) for group in groups),
         tuple(int(np.count_nonzero(group)) for group in groups),
     )
+
+
+def recall_by_distance(truth: Truth, hits: BoolArray, category: int) -> list[dict[str, Any]]:
+    """Of one class, for each bin of distance: how many objects, and how many found at IoU 0.50.
+
+    Bins without objects are left out, and so are objects whose distance is not known.
+    """
+    own = (truth.category == category) & ~truth.crowd & np.isfinite(truth.distance_m)
+    ends = (*DISTANCE_EDGES_M[1:], np.inf)
+    rows = []
+    for start, end in zip(DISTANCE_EDGES_M, ends, strict=True):
+        here = own & (truth.distance_m >= start) & (truth.distance_m < end)
+        if here.any():
+            count, found = np.count_nonzero(here), np.count_nonzero(hits[here, 0])
+            rows.append(
+                {
+                    "from_m": start,
+                    "to_m": None if np.isinf(end) else end,
+                    "objects": int(count),
+                    "found": int(found),
+                    "recall50": found / count,
+                }
+            )
+    return rows
 
 
 def require_pycocotools() -> None:
@@ -235,14 +268,20 @@ def _coco(annotations: list[dict[str, Any]], classes: int, images: int) -> Any:
     return coco
 
 
-def _hits(evaluation: Any, objects: int) -> BoolArray:
+def _hits(evaluation: Any, objects: int, classes: int) -> tuple[BoolArray, tuple[int, ...]]:
+    """See `Measures`: `hits` and `false`."""
     hits = np.zeros((objects, len(evaluation.params.iouThrs)), np.bool_)
+    false = [0] * classes
     everything = evaluation.params.areaRng[0]
     for judged in evaluation.evalImgs:
         if judged is not None and judged["aRng"] == everything:
             index = np.asarray(judged["gtIds"], np.int64) - 1
             hits[index] = (np.asarray(judged["gtMatches"]) > 0).T
-    return hits
+            wrong = (np.asarray(judged["dtMatches"])[0] == 0) & (
+                np.asarray(judged["dtIgnore"])[0] == 0
+            )
+            false[judged["category_id"]] += int(np.count_nonzero(wrong))
+    return hits, tuple(false)
 
 
 def _overall(rows: Sequence[Row]) -> Row:

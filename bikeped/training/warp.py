@@ -34,6 +34,7 @@ from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
 EDGE_SAMPLES, OUTLINE_SAMPLES, RIM_SAMPLES = 256, 1024, 4096
 #: Where the lens sees and the picture has nothing: the grey that detectors know as "no picture".
 FILL = 114
+_HALVINGS = 24  # of the way between two samples, to where a curve leaves what is seen
 _SHARE_GRID = 24  # points a side that tell how much of a box is left
 _WIDEST = {"orthographic": 178.0, "stereographic": 300.0}  # short of the model's own end
 _ROOM = 359.0
@@ -279,16 +280,20 @@ def warp_boxes(
     border: tuple[FloatArray, FloatArray] | None = None
     for index, box in enumerate(boxes):
         rings = polygons[index] if polygons is not None else ()
-        curve = _box_edges(box) if len(rings) == 0 else np.concatenate([*map(_outline, rings)])
-        uv, seen = warp.forward(curve, picture_wh)
-        points = uv[seen]
-        if seen.all():
+        curves = [_box_edges(box)] if len(rings) == 0 else [*map(_outline, rings)]
+        mapped = [warp.forward(curve, picture_wh) for curve in curves]
+        points = np.concatenate([uv[seen] for uv, seen in mapped])
+        if all(seen.all() for _, seen in mapped):
             share[index] = 1.0
         else:
             if border is None:
                 border = _border(warp, picture_wh)
             edge_uv, edge_xy = border
-            points = np.concatenate([points, edge_uv[_within(edge_xy, box, rings)]])
+            ends = [
+                _where_it_leaves(warp, picture_wh, curve, seen)
+                for curve, (_, seen) in zip(curves, mapped, strict=True)
+            ]
+            points = np.concatenate([points, *ends, edge_uv[_within(edge_xy, box, rings)]])
             share[index] = _share_left(warp, picture_wh, box, rings)
         if len(points):
             result[index, :2], result[index, 2:] = points.min(axis=0), points.max(axis=0)
@@ -314,6 +319,22 @@ def _outline(ring: FloatArray) -> FloatArray:
     along = (np.arange(int(parts.sum())) - first) / np.repeat(parts, parts)
     start, step = np.repeat(ring, parts, axis=0), np.repeat(step, parts, axis=0)
     return np.asarray(start + step * along[:, None])
+
+
+def _where_it_leaves(
+    warp: Warp, picture_wh: Size, curve: FloatArray, seen: BoolArray
+) -> FloatArray:
+    """[k, 2] the last points seen of a closed curve where it leaves what the lens shows."""
+    after = np.roll(seen, -1)
+    leaves = np.nonzero(seen != after)[0]
+    here, there = curve[leaves], np.roll(curve, -1, axis=0)[leaves]
+    turned = ~seen[leaves][:, None]
+    inner, outer = np.where(turned, there, here), np.where(turned, here, there)
+    for _ in range(_HALVINGS):
+        middle = (inner + outer) / 2
+        is_seen = warp.forward(middle, picture_wh)[1][:, None]
+        inner, outer = np.where(is_seen, middle, inner), np.where(is_seen, outer, middle)
+    return warp.forward(inner, picture_wh)[0]
 
 
 def _border(warp: Warp, picture_wh: Size) -> tuple[FloatArray, FloatArray]:

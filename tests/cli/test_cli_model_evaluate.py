@@ -84,6 +84,19 @@ def test_two_models_side_by_side(file, models, tmp_path, capsys):
     assert figure.with_suffix(".pdf").is_file()
 
 
+def test_false_boxes_and_distances_are_told(file, models, capsys):
+    body = json.loads(file.read_text())
+    for number, thing in enumerate(body["annotations"]):
+        thing["distance_m"] = 4.0 * number  # person 0, car 4; person 8, car 12
+    body["annotations"].pop()
+    file.write_text(json.dumps(body))
+    assert main(["model", "evaluate", models[0], str(file), *CPU]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["coco", "0", "0", "50"] in lines  # the car of the second picture is one too many
+    assert ["pedestrian", "5", "to", "10", "1", "0"] in lines
+    assert ["vehicle", "0", "to", "5", "1", "1"] in lines
+
+
 def test_the_simulation_runs_with_the_curve(file, models, tmp_path, capsys):
     curve = tmp_path / "curve.json"
     words = [models[0], str(file), "--curve", str(curve), "--curve-iou", "0.5"]

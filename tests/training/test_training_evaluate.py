@@ -16,15 +16,16 @@ from bikeped.conformance.perception import AREA_SCALE
 from bikeped.detection.facts import ModelMetadata
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DataSetError, DetectorError
+from bikeped.scene.dataset import write_dataset
 from bikeped.training.coco import read_coco
 from bikeped.training.evaluate import (
-    INPUT_PX,
     EvaluationSettings,
     ModelUnderTest,
     evaluate,
     load_models,
 )
 from bikeped.training.evaluation_figures import draw_evaluation, evaluation_rows
+from bikeped.training.truths import INPUT_PX
 
 CPU = DetectionConfig(providers=("cpu",), threads=1)
 ONE = EvaluationSettings(least_objects=1)
@@ -197,6 +198,31 @@ def test_models_are_told_apart(tmp_path):
         load_models([("a", tmp_path / "1.onnx"), ("a", tmp_path / "2.onnx")], CPU)
     with pytest.raises(DetectorError, match="1\\.onnx"):
         load_models([("a", tmp_path / "1.onnx")], CPU)
+
+
+def test_drawn_scenes_are_read_and_judged_by_distance(tmp_path):
+    """Data of `bikeped.scene`: a network that answers the truth finds everything, near and far."""
+    data = read_coco(write_dataset(tmp_path / "scenes", 4, 1, size=(480, 270)))
+    assert list(data.categories.values()) == ["pedestrian", "cyclist", "vehicle"]
+    scale, top = 320 / 480, (320 - 180) // 2
+    answers = []
+    for image in data.images:
+        boxes = [(t.category_id - 1, np.multiply(t.box_px, scale)) for t in data.objects[image.id]]
+        answers.append(
+            [(c, [b[0], b[1] + top - 40, b[2] - b[0], b[3] - b[1]], 0.9) for c, b in boxes]
+        )
+    network = Told(*answers)
+    network.metadata = ModelMetadata(
+        names=("pedestrian", "cyclist", "vehicle"), end_to_end=True, ultralytics=True
+    )
+    detector = NetworkDetector(Path("told.onnx"), CPU, "0" * 64, network)
+    result = evaluate(data, [ModelUnderTest("told", Path("told.onnx"), detector)], CPU, ONE)
+    (score,) = result.scores
+    assert score.classes.overall.ar > 0.9  # boxes of a few pixels are rounded
+    known = [t for found in data.objects.values() for t in found if not t.crowd]
+    bins = [one for of_kind in score.by_distance.values() for one in of_kind]
+    assert sum(one["objects"] for one in bins) == len(known) > 5
+    assert sum(score.road_users.false) == 0
 
 
 @pytest.mark.skipif(bool(missing(MODEL, CLIP)), reason=missing(MODEL, CLIP))

@@ -13,7 +13,7 @@ from bikeped.conformance.montecarlo import load_recall_curve
 from bikeped.conformance.perception import RecallModel
 from bikeped.errors import BikepedError, DataSetError
 from bikeped.training.evaluate import write_curve
-from bikeped.training.measures import Curve, Found, Truth, measure, recall_curve
+from bikeped.training.measures import Curve, Found, Truth, measure, recall_by_distance, recall_curve
 from bikeped.types import Kind
 
 NAMES = ("one", "two")
@@ -26,6 +26,7 @@ def truth(*rows):
         np.array([r[1] for r in rows], np.int64),
         np.array([r[2] for r in rows], np.float64).reshape(-1, 4),
         np.array([len(r) > 3 and r[3] for r in rows], np.bool_),
+        np.array([r[4] if len(r) > 4 else np.nan for r in rows], np.float64),
     )
 
 
@@ -95,6 +96,7 @@ def test_a_crowd_neither_counts_nor_harms():
     answers = found((0, 0, BOX, 0.5), (0, 0, [310, 310, 330, 330], 0.9), (0, 0, FAR, 0.8))
     row = measure(things, answers, NAMES, 1).rows[0]
     assert (row.ap, row.objects) == (pytest.approx(1), 1)
+    assert measure(things, answers, NAMES, 1).false == (0, 0)
     assert recall_curve(things, measure(things, answers, NAMES, 1).hits, 1).objects == (1,)
 
 
@@ -104,6 +106,32 @@ def test_nothing_found_and_nothing_there():
     none = measure(truth(), found((0, 0, BOX, 0.5)), NAMES, 1)
     assert (none.overall.ap, none.overall.ar, none.overall.objects) == (None, None, 0)
     assert recall_curve(truth(), none.hits, 1) == Curve((), (), (), ())
+
+
+def test_false_alarms_are_counted_by_class():
+    answers = found(
+        (0, 0, BOX, 0.9),
+        (0, 0, [60, 0, 160, 100], 0.8),  # IoU 0.25 with the object
+        (1, 0, BOX, 0.7),  # in the other picture
+        (0, 1, BOX, 0.6),  # as the other class
+        (0, 0, [1, 0, 100, 100], 0.5),  # the object again
+    )
+    assert measure(truth((0, 0, BOX)), answers, NAMES, 2).false == (3, 1)
+
+
+def test_recall_by_distance():
+    boxes = [[200 * n, 0, 200 * n + 100, 100] for n in range(5)]
+    metres = (0.5, 4.9, 5.0, 40.0, np.nan)
+    things = truth(
+        *((0, 0, box, False, m) for box, m in zip(boxes, metres, strict=True)),
+        (0, 0, [0, 500, 100, 600], True, 3.0),
+        (0, 1, [0, 700, 100, 800], False, 3.0),
+    )
+    hits = measure(things, found((0, 0, boxes[0], 0.9), (0, 0, boxes[3], 0.9)), NAMES, 1).hits
+    near, five, far = recall_by_distance(things, hits, 0)
+    assert near == {"from_m": 0, "to_m": 5, "objects": 2, "found": 1, "recall50": 0.5}
+    assert (five["from_m"], five["objects"], five["found"]) == (5, 1, 0)
+    assert far == {"from_m": 25, "to_m": None, "objects": 1, "found": 1, "recall50": 1.0}
 
 
 def test_the_curve_is_recall_by_bin():

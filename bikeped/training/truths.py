@@ -1,0 +1,107 @@
+"""What there is to find, as arrays: a data set's boxes by class, or as road users.
+
+Road users are what the deployed detector means by them: a person on a bicycle and the bicycle are
+one cyclist, joined here by the very function that joins the detector's answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bikeped.config.sections import DetectionConfig
+from bikeped.detection.riders import join_riders
+from bikeped.training.coco import CocoData, CocoImage, CocoObject
+from bikeped.training.measures import Truth
+from bikeped.types import Detections, Kind
+
+#: Side of the network input that areas are measured at (definitions, section 3).
+INPUT_PX = 1280
+#: Classes whose box holds the cycle alone; any other cyclist's box holds the rider, too.
+BARE_CYCLES = frozenset({"bicycle", "motorcycle"})
+
+
+def kinds_by_name(names: Mapping[int, str], detection: DetectionConfig) -> dict[int, Kind]:
+    """Which of the named classes are which kind of road user."""
+    wanted = {
+        plain_name(name): kind
+        for kind, given in (
+            (Kind.PEDESTRIAN, detection.pedestrian),
+            (Kind.CYCLIST, detection.cyclist),
+            (Kind.VEHICLE, detection.vehicle),
+        )
+        for name in given
+    }
+    return {i: wanted[plain_name(name)] for i, name in names.items() if plain_name(name) in wanted}
+
+
+def truth_of(data: CocoData, group_of: Mapping[int, int]) -> Truth:
+    """The data's boxes, their categories mapped by `group_of`; others are left out."""
+    rows = _Rows()
+    for number, picture in enumerate(data.images):
+        for thing in data.objects[picture.id]:
+            if thing.category_id in group_of:
+                rows.add(number, picture, group_of[thing.category_id], thing)
+    return rows.truth()
+
+
+def joined_truth(data: CocoData, kind_of: Mapping[int, Kind], detection: DetectionConfig) -> Truth:
+    """The data's road users as the deployed detector means them: riders joined to their cycles."""
+    rows = _Rows()
+    bare = {i for i, name in data.categories.items() if plain_name(name) in BARE_CYCLES} & set(
+        kind_of
+    )
+    people = {i for i, kind in kind_of.items() if kind is Kind.PEDESTRIAN}
+    for number, picture in enumerate(data.images):
+        things = [t for t in data.objects[picture.id] if t.category_id in kind_of]
+        parts: list[CocoObject] = []
+        if any(t.category_id in bare and not t.crowd for t in things):
+            parts = [t for t in things if t.category_id in bare | people and not t.crowd]
+        for thing in things:
+            if thing not in parts:
+                rows.add(number, picture, int(kind_of[thing.category_id]), thing)
+        joined = join_riders(
+            Detections(
+                np.array([kind_of[t.category_id] for t in parts], np.int8),
+                np.ones(len(parts), np.float32),
+                np.array([t.box_px for t in parts], np.float32).reshape(-1, 4),
+            ),
+            detection.rider_overlap,
+            detection.confidence,
+        )
+        for kind, box in zip(joined.kind.tolist(), joined.box_px.tolist(), strict=True):
+            rows.add(number, picture, kind, CocoObject(0, picture.id, 0, tuple(box)))
+    return rows.truth()
+
+
+class _Rows:
+    """Objects gathered for a `Truth`, boxes in pixels at the network's input."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, int, bool, float]] = []
+        self._boxes: list[Any] = []
+
+    def add(self, number: int, picture: CocoImage, group: int, thing: CocoObject) -> None:
+        """One object of picture `number`."""
+        scale = INPUT_PX / max(picture.width, picture.height)
+        distance_m = np.nan if thing.distance_m is None else thing.distance_m
+        self._rows.append((number, group, thing.crowd, distance_m))
+        self._boxes.append(np.multiply(thing.box_px, scale))
+
+    def truth(self) -> Truth:
+        """All of them."""
+        rows = self._rows
+        return Truth(
+            np.array([row[0] for row in rows], np.int64),
+            np.array([row[1] for row in rows], np.int64),
+            np.array(self._boxes, np.float64).reshape(-1, 4),
+            np.array([row[2] for row in rows], np.bool_),
+            np.array([row[3] for row in rows], np.float64),
+        )
+
+
+def plain_name(name: str) -> str:
+    """A class name as it is compared: without regard to case and outer blanks."""
+    return name.strip().lower()
