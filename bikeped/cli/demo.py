@@ -15,6 +15,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import guarded
+from bikeped.cli.web_options import open_pages, web_option, web_overrides
 from bikeped.config import framing, ground_camera, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
@@ -34,6 +35,7 @@ from bikeped.files import make_folder, write_whole
     type=click.FloatRange(min=0.1),
     help="Only the beginning: so many seconds of the crossing.",
 )
+@web_option
 @json_option
 @guarded
 def command(
@@ -41,6 +43,7 @@ def command(
     overrides: tuple[str, ...],
     out: Path,
     seconds: float | None,
+    web_place: str | None,
     json_path: str | None,
 ) -> None:
     """Draw a scripted crossing as fisheye video and run it through the whole loop."""
@@ -58,7 +61,10 @@ def command(
 
     if seconds is not None and not math.isfinite(seconds):
         raise BikepedError(f"--seconds {seconds}: is not a number of seconds; give e.g. 5")
+    if web_place is not None:
+        overrides += web_overrides(web_place)
     loaded = load_config(config_path, overrides)
+    pages = None if web_place is None else open_pages(loaded)
     make_folder(out)
     scenario = load_scenario(bundled_scenario())
     clip, events, overlay = out / "crossing.avi", out / "events.jsonl", out / "overlay.mp4"
@@ -79,8 +85,10 @@ def command(
             str(clip),
             eye=DrawnEye(DrawnBoxDetector(sidecar_path(clip))),
             files=ReplayFiles(events, overlay),
+            realtime=pages is not None,
             mqtt=False,
             progress=tell,
+            pages=pages,
         )
     lines = [json.loads(line) for line in events.read_text(encoding="utf-8").splitlines()]
     summary = {

@@ -17,6 +17,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded
+from bikeped.cli.web_options import open_pages, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.files import make_folder
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 @click.option("--events", type=click.Path(path_type=Path), help="Event file, JSON Lines.")
 @click.option("--no-mqtt", is_flag=True, help="Publish nothing, whatever the configuration says.")
 @click.option("--realtime", is_flag=True, help="At the recording's own pace.")
+@web_option
 @json_option
 @guarded
 def command(
@@ -47,12 +49,16 @@ def command(
     events: Path | None,
     no_mqtt: bool,
     realtime: bool,
+    web_place: str | None,
     json_path: str | None,
 ) -> int:
     """Run VIDEO (a file or a folder of pictures) through the loop and say what it decided."""
     from bikeped.service.replay import ReplayFiles, replay
 
+    if web_place is not None:
+        overrides += web_overrides(web_place)
     loaded = load_config(config_path, overrides)
+    pages = None if web_place is None else open_pages(loaded)
     if out is not None:
         make_folder(out)
         overlay = overlay or out / "overlay.mp4"
@@ -64,9 +70,10 @@ def command(
             loaded,
             video,
             files=ReplayFiles(events, overlay),
-            realtime=realtime,
+            realtime=realtime or pages is not None,
             mqtt=not no_mqtt,
             progress=progress,
+            pages=pages,
         )
     summary = result.as_dict()
     if out is not None:

@@ -11,6 +11,7 @@ from typing import NoReturn
 import click
 
 from bikeped.cli.common import config_options
+from bikeped.cli.web_options import open_pages
 from bikeped.config import load_config
 
 
@@ -23,11 +24,7 @@ def command(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
     root = logging.getLogger()
     root.setLevel(min(root.level, logging.INFO))
     loaded = load_config(config_path, overrides)
-    pages = None
-    if loaded.config.web.enabled:
-        from bikeped.web.service import ServicePages
-
-        pages = ServicePages(loaded)
+    pages = open_pages(loaded) if loaded.config.web.enabled else None
     status = run_service(loaded, pages=pages)
     # Everything is stopped and the light is dark. A thread that is stuck in a driver must not keep
     # the process: leave without joining it.

@@ -25,6 +25,7 @@ class Inside:
 
     loaded: LoadedConfig
     judge: Judge
+    source: str  #: the camera, or the recording
     detector: str
     health: Callable[[], HealthMessage]
     metrics: CollectorRegistry

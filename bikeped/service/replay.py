@@ -185,6 +185,7 @@ async def _replay(
             inside = Inside(
                 loaded=loaded,
                 judge=judge,
+                source=source.name,
                 detector=eye.name,
                 health=health,
                 metrics=metrics.registry,

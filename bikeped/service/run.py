@@ -139,6 +139,7 @@ async def _serve(
         inside = Inside(
             loaded=loaded,
             judge=judge,
+            source=camera.source,
             detector=eye.name,
             health=health,
             metrics=metrics.registry,

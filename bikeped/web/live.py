@@ -82,6 +82,11 @@ class Live:
                 await asyncio.sleep(1.0 / EVENTS_HZ)
             return response
 
+    async def room(self, _request: web.Request) -> web.Response:
+        """204 when there is room for one more page: browsers do not tell why a stream failed."""
+        with self._counted("_pages"):
+            return web.Response(status=204)
+
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """The picture with boxes, tracks and the pair, as Motion JPEG."""
         with self._counted("_streams"), self.painter.looking():
@@ -123,7 +128,7 @@ class Live:
             "stages": STAGES,
             "config_hash": loaded.hash,
             "calibration_hash": loaded.calibration_hash,
-            "source": config.camera.source,
+            "source": self._inside.source,
             "detector": self._inside.detector,
             "light": config.feedback.light,
             "rule": config.decision.rule,
@@ -156,8 +161,9 @@ def add_live(app: web.Application, live: Live) -> None:
     """Adds `/` and `/live/...`."""
     page = Page("/", "Live", "Live", "live.html", scripts=("live.js",), styles=("live.css",))
     add_page(app, page)
-    app.router.add_get("/live/events", live.events)
-    app.router.add_get("/live/stream", live.stream)
+    app.router.add_get("/live/events", live.events, allow_head=False)
+    app.router.add_get("/live/stream", live.stream, allow_head=False)
+    app.router.add_get("/live/room", live.room)
 
     async def close(_app: web.Application) -> None:
         live.close()

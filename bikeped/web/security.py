@@ -33,7 +33,7 @@ SHORTEST_TOKEN = 12
 #: Bodies are settings and scenarios: text, never video.
 MAX_BODY = 1024 * 1024
 #: Open to those who have not logged in: what the login page is made of.
-_OPEN = ("/login", "/static/")
+_OPEN = ("/login", "/session", "/static/")
 _SAFE_METHODS = frozenset({hdrs.METH_GET, hdrs.METH_HEAD, hdrs.METH_OPTIONS})
 
 HEADERS = {
@@ -44,7 +44,8 @@ HEADERS = {
     ),
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
+    # Not no-referrer: forms would then be posted with "Origin: null".
+    "Referrer-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=()",
@@ -88,6 +89,10 @@ class Access:
             return False
         right = hmac.compare_digest(_digest(signature), _digest(self._sign(expires)))
         return right and len(expires) < 16 and now_s < float(expires)
+
+    def has_session(self, request: web.Request) -> bool:
+        """Whether a request is let in without being asked for the token."""
+        return self.token is None or self.is_cookie(request.cookies.get(COOKIE, ""), time.time())
 
     def _sign(self, text: str) -> str:
         key = (self.token or "").encode()
@@ -193,9 +198,7 @@ def guard(access: Access, login: Callable[[web.Request], web.Response], failures
                 actual_size=request.content_length or 0,
                 headers={hdrs.CONNECTION: "close"},
             )
-        if access.token is None or request.path.startswith(_OPEN):
-            return await handler(request)
-        if access.is_cookie(request.cookies.get(COOKIE, ""), time.time()):
+        if request.path.startswith(_OPEN) or access.has_session(request):
             return await handler(request)
         scheme, _, given = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
         if scheme.lower() == "bearer":

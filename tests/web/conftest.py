@@ -9,7 +9,9 @@ module holds no `async def` test.
         page = open_page(url + "/mine")
 
 `open_page` fails the test at its end on any console error, page error or failed request that the
-test did not expect (`page_errors(page).clear()` after an expected one).
+test did not expect (`page_errors(page).clear()` after an expected one). To wait for something, use
+playwright's `expect` or `until(page, "an expression")`: `page.wait_for_function` evaluates text,
+which the pages' policy forbids.
 """
 
 from __future__ import annotations
@@ -17,13 +19,21 @@ from __future__ import annotations
 import asyncio
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 from aiohttp import web
 from axe_playwright_python.base import AXE_SCRIPT
-from playwright.sync_api import Browser, BrowserContext, Page, Playwright, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    Page,
+    Playwright,
+    expect,
+    sync_playwright,
+)
 from web_fakes import DESKTOP
 
 from bikeped.config import WebConfig
@@ -103,6 +113,7 @@ def serve(start_server: Callable[..., Served]) -> Callable[..., str]:
 def playwright() -> Iterator[Playwright]:
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed: apt-get install chromium")
+    expect.set_options(timeout=PATIENCE_S * 1e3)
     with sync_playwright() as running:
         yield running
 
@@ -122,6 +133,20 @@ _errors: dict[Page, list[str]] = {}
 def page_errors() -> Callable[[Page], list[str]]:
     """What went wrong in a page so far: console errors, exceptions, requests that failed."""
     return lambda page: _errors[page]
+
+
+@pytest.fixture
+def until() -> Callable[[Page, str], Any]:
+    """Waits until an expression in a page is true, and returns its value."""
+
+    def wait(page: Page, expression: str) -> Any:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not (value := page.evaluate(expression)):
+            assert time.monotonic() < deadline_s, f"never came true: {expression}"
+            page.wait_for_timeout(30)
+        return value
+
+    return wait
 
 
 @pytest.fixture

@@ -1,1 +1,355 @@
-export {};
+// The live page. What comes: `hello` once, `now` up to ten times a second, `status` every second,
+// `alerts` and `trend` when there are new ones. When nothing comes, the page says so, in grey.
+
+import { $, STATES, announce, clock, count, duration, el, fixed, metres, millis, seconds, setText, speed, stateIcon } from "/static/ui.js";
+import { Radar } from "/static/radar.js";
+import { Sparkline } from "/static/sparkline.js";
+
+const PATIENCE_S = 2.5;      // without a message for so long, contact is lost
+const OLD_S = 2;             // a signal or a picture older than this is not of now
+const RETRY_S = 3;
+const SAY_S = 3;             // a screen reader hears of changes no faster than this
+const STAGE_WORDS = {
+  acquire: "Read the camera", pre: "Decode, scale", inference: "Detect", post: "Sort out",
+  track: "Track", decide: "Decide", feedback: "Tell the light", total: "All of it", capture_age: "Since capture",
+};
+
+const radar = new Radar($("#radar"));
+const sparks = new Map();
+const trend = [];
+let hello = null;
+let source = null;
+let heard = null;            // when the last message came
+let shown = null;            // the state on the page
+let since = null;            // since when, by this page's clock
+let lostSince = performance.now();
+let refusal = null;          // why the box does not let us look
+let retry = null;
+let paused = false;       // the visitor wants no picture
+let broken = false;       // the picture's stream has ended
+let pictureTried = 0;
+
+// --- contact
+
+function connect() {
+  if (document.hidden || source !== null) return;
+  source = new EventSource("/live/events");
+  const on = (name, take) => source.addEventListener(name, (event) => {
+    heard = performance.now();
+    take(JSON.parse(event.data));
+  });
+  on("hello", takeHello);
+  on("now", takeNow);
+  on("alerts", showAlerts);
+  on("status", showStatus);
+  on("trend", takeTrend);
+  source.onerror = () => {
+    if (source === null || source.readyState !== EventSource.CLOSED) return;
+    disconnect();
+    whyNot();
+    retry = setTimeout(connect, RETRY_S * 1000);
+  };
+}
+
+function disconnect() {
+  clearTimeout(retry);
+  source?.close();
+  source = null;
+}
+
+// The browser does not tell why a stream was refused: ask again, as a page would.
+async function whyNot() {
+  try {
+    const answer = await fetch("/live/room", { headers: { Accept: "text/plain" } });
+    if (answer.status === 401) location.reload();
+    refusal = answer.status === 503 ? "As many pages look at this box as it allows. Close one." : null;
+  } catch {
+    refusal = null;
+  }
+}
+
+function takeHello(data) {
+  refusal = null;
+  if (hello !== null && hello.config_hash !== data.config_hash) trend.length = 0;
+  hello = data;
+  radar.describe(data);
+  buildLatency(data.stages);
+  startPicture();
+}
+
+function takeNow(data) {
+  const old = data.signal_age_s === null || data.signal_age_s > OLD_S;
+  if (old) {
+    lose(data.signal_age_s === null
+      ? "The box has told its light nothing yet."
+      : `The box runs, but has decided nothing for ${duration(data.signal_age_s)}.`);
+    return;
+  }
+  $("#live").dataset.contact = "live";
+  lostSince = null;
+  radar.setLive(true);
+  showState(data.signal, data.sentence || STATES[data.signal]?.word || data.signal);
+  setText($("#light-now"), lightWords(data));
+  $("#state-facts").hidden = false;
+  showPair(data);
+  showTracks(data);
+  showPictureAge(data);
+  radar.show(data.tracks, data.pair, data.decided === "ALERT" && data.signal !== "FAULT");
+}
+
+function lightWords({ colour, blink_hz }) {
+  if (colour === "off") return "dark";
+  return blink_hz > 0 ? `${colour}, blinking` : colour;
+}
+
+// A dead page must not reassure: no colour of a state, the word, and since when.
+function lose(sentence) {
+  lostSince ??= performance.now();
+  $("#live").dataset.contact = heard === null ? "none" : "lost";
+  $("#state-facts").hidden = true;
+  radar.setLive(false);
+  showState("STALE", sentence);
+  if (!paused) setText($("#picture-note"), broken ? "The picture has stopped." : "This picture is old.");
+}
+
+setInterval(() => {
+  const now = performance.now();
+  if (since !== null) setText($("#state-for"), duration((now - since) / 1000));
+  if (heard !== null && now - heard < PATIENCE_S * 1000) return;
+  const from = heard ?? lostSince ?? now;
+  if (heard === null && refusal === null && now - from < PATIENCE_S * 1000) return;
+  const ago = duration((now - from) / 1000);
+  lose(refusal ?? (heard === null
+    ? "The box does not answer."
+    : `Nothing has been heard from the box for ${ago}. What stands below is old.`));
+}, 500);
+
+document.addEventListener("visibilitychange", () => {
+  // Who does not look costs the box nothing.
+  if (document.hidden) {
+    disconnect();
+    stopPicture();
+  } else {
+    connect();
+  }
+});
+addEventListener("pagehide", () => { disconnect(); stopPicture(); });
+addEventListener("pageshow", (event) => { if (event.persisted) connect(); });
+
+// --- the state
+
+let saidAt = -Infinity;
+let sayLater = null;
+
+function say(text) {
+  clearTimeout(sayLater);
+  const wait = saidAt + SAY_S * 1000 - performance.now();
+  if (wait > 0) {
+    sayLater = setTimeout(() => say(text), wait);
+    return;
+  }
+  saidAt = performance.now();
+  announce(text);
+}
+
+function showState(name, sentence) {
+  const word = STATES[name]?.word ?? name;
+  if (name !== shown) {
+    shown = name;
+    since = performance.now();
+    $("#state").dataset.state = name;
+    $("#state-mark").replaceChildren(stateIcon(name));
+    setText($("#state-word"), word);
+    document.title = `${word} · Live · bikeped`;
+    say(`${word}. ${sentence}`);
+  }
+  setText($("#state-sentence"), withoutName(name, sentence));
+}
+
+// "ALERT: cyclist 3 ..." under the word ALERT says it twice.
+function withoutName(name, sentence) {
+  const rest = sentence.startsWith(`${name}: `) ? sentence.slice(name.length + 2) : sentence;
+  return rest.charAt(0).toUpperCase() + rest.slice(1);
+}
+
+// --- the picture
+
+function startPicture() {
+  if (paused || document.hidden) return;
+  broken = false;
+  pictureTried = performance.now();
+  $("#picture").src = `/live/stream?from=${Date.now()}`;
+  setText($("#picture-note"), "");
+}
+
+function stopPicture() {
+  $("#picture").removeAttribute("src");
+}
+
+$("#picture").addEventListener("load", fitPicture);
+$("#picture").addEventListener("error", () => {
+  broken = true;
+  setText($("#picture-note"), "The picture has stopped.");
+});
+
+function fitPicture() {
+  const picture = $("#picture");
+  if (picture.naturalWidth > 0) {
+    picture.width = picture.naturalWidth;
+    picture.height = picture.naturalHeight;
+  }
+}
+
+$("#picture-switch").addEventListener("click", () => {
+  paused = !paused;
+  const button = $("#picture-switch");
+  button.setAttribute("aria-pressed", String(paused));
+  setText(button, paused ? "Go on" : "Pause");
+  if (paused) {
+    stopPicture();
+    setText($("#picture-note"), "Paused: no picture is sent.");
+  } else {
+    startPicture();
+  }
+});
+
+function showPictureAge({ frame_age_s }) {
+  const old = frame_age_s === null || frame_age_s > OLD_S;
+  $("#picture-frame").toggleAttribute("data-old", old);
+  if (paused) return;
+  if (broken) {
+    if (performance.now() - pictureTried > RETRY_S * 1000) startPicture();
+    return;
+  }
+  setText($("#picture-note"), frame_age_s === null ? "No picture yet." : old ? `This picture is ${duration(frame_age_s)} old.` : "");
+}
+
+// --- pair, tracks
+
+function showPair({ pair }) {
+  const none = pair === null;
+  $("#why").hidden = none;
+  $("#why-none").hidden = !none;
+  if (none) return;
+  facts($("#why"), [
+    ["Who", `cyclist ${pair.cyclist} and pedestrian ${pair.pedestrian}`],
+    ["Apart", metres(pair.distance_m)],
+    [`${seconds(pair.lookback_s, 2)} before`, metres(pair.distance_then_m, 2)],
+    ["Judged between", `${metres(pair.d_min_m)} and ${metres(pair.d_max_m)}`],
+    ["Cyclist", `${speed(pair.speed_mps)}, moved ${metres(pair.displacement_m, 2)}`],
+  ]);
+}
+
+// Rows of a description list, changed in place.
+function facts(list, rows) {
+  while (list.children.length > 2 * rows.length) list.lastChild.remove();
+  rows.forEach(([name, value, kind], i) => {
+    if (!list.children[2 * i]) list.append(el("dt"), el("dd"));
+    setText(list.children[2 * i], name);
+    const place = list.children[2 * i + 1];
+    setText(place, value);
+    place.className = kind ?? "";
+  });
+}
+
+function showTracks({ tracks, pair }) {
+  const body = $("#tracks");
+  $("#tracks-none").hidden = tracks.length > 0;
+  $("#tracks-scroll").hidden = tracks.length === 0;
+  const away = (track) => Math.hypot(track.x, track.y);
+  const order = [...tracks].sort((a, b) => away(a) - away(b)).slice(0, 12);
+  while (body.children.length > order.length) body.lastChild.remove();
+  order.forEach((track, i) => {
+    const row = body.children[i] ?? body.appendChild(el("tr", {},
+      el("th", { scope: "row" }, el("span", { class: "swatch", "aria-hidden": "true" }), el("span")),
+      el("td", { class: "number" }), el("td", { class: "number" }), el("td")));
+    const [who, far, fast, seen] = row.children;
+    who.firstChild.className = `swatch ${track.kind}`;
+    setText(who.lastChild, `${track.kind} ${track.id}`);
+    setText(far, metres(away(track)));
+    setText(fast, speed(Math.hypot(track.vx, track.vy)));
+    setText(seen, track.unseen_s > 0 ? `${seconds(track.unseen_s)} ago` : "now");
+    row.toggleAttribute("data-paired", pair !== null && (track.id === pair.cyclist || track.id === pair.pedestrian));
+  });
+  $("#radar").setAttribute("aria-label", order.length === 0 ? "Nobody is seen" : `${order.length} road users from above; the table of road users has the figures`);
+}
+
+// --- alerts
+
+function showAlerts(alerts) {
+  const list = $("#alerts");
+  list.hidden = alerts.length === 0;
+  $("#alerts-none").hidden = alerts.length > 0;
+  list.replaceChildren(...[...alerts].reverse().map((alert) => {
+    const lasts = alert.ended_unix_s === null;
+    const pair = alert.pair;
+    return el("li", {},
+      el("p", { class: "when" },
+        el("span", {}, clock(alert.started_unix_s * 1000)),
+        el("span", { class: lasts ? "going" : "" }, lasts ? "now" : seconds(alert.ended_unix_s - alert.started_unix_s))),
+      el("p", {}, withoutName("ALERT", alert.sentence)),
+      pair && el("p", { class: "figures" },
+        `${metres(pair.distance_m)} apart at the start${lasts ? "" : `, ${metres(alert.nearest_m)} at the nearest`}; cyclist ${speed(pair.speed_mps)}${lasts ? "" : `; ${count(alert.frames, "frame")}`}`));
+  }));
+}
+
+// --- health
+
+function showStatus({ health, mqtt }) {
+  const faults = $("#faults");
+  faults.hidden = health.faults.length === 0;
+  faults.replaceChildren(...health.faults.map((text) => el("li", {}, text)));
+  const part = ({ ok, detail }) => [detail, ok ? "ok-mark" : "bad-mark"];
+  const { frames, dropped, undecodable, alerts, mqtt_dropped, audit_dropped } = health.counters;
+  const rows = [
+    ["Camera", ...part(health.camera)],
+    ["Detector", ...part(health.detector)],
+    ["Light", ...part(health.light)],
+    ["MQTT", ...brokerWords(mqtt)],
+    ["Rate", `${fixed(health.fps, 1)} frames/s`],
+    ["Newest frame", health.camera.capture_age_ms === null ? "none yet" : `${millis(health.camera.capture_age_ms)} old`],
+    ["Since start", `${duration(health.uptime_s)}, ${count(frames, "frame")}, ${count(alerts, "alert")}`],
+    ["Lost", `${dropped} replaced, ${undecodable} undecodable, ${mqtt_dropped} messages, ${audit_dropped} log lines`],
+    ["Watching", hello?.source ?? "–"],
+    ["Model", hello?.detector ?? "–"],
+    ["Rule", hello ? `${hello.rule}, configuration ${hello.config_hash.slice(0, 12)}` : "–"],
+    ["Version", health.version],
+  ];
+  facts($("#health"), rows);
+  for (const [stage, row] of latencyRows) {
+    const figures = health.latency_ms[stage];
+    ["p50", "p95", "max"].forEach((name, i) => setText(row.children[2 + i], figures ? fixed(figures[name], figures[name] < 10 ? 2 : 0) : "–"));
+  }
+}
+
+function brokerWords(mqtt) {
+  if (mqtt === null) return ["not configured", ""];
+  if (mqtt.connected) return [`connected to ${hello?.broker ?? "the broker"}, ${mqtt.published} messages sent`, "ok-mark"];
+  return [`not connected to ${hello?.broker ?? "the broker"}${mqtt.error ? `: ${mqtt.error}` : ""}`, "bad-mark"];
+}
+
+// --- latencies
+
+const latencyRows = new Map();
+
+function buildLatency(stages) {
+  if (latencyRows.size) return;
+  for (const stage of stages) {
+    const canvas = el("canvas", { "aria-hidden": "true" });
+    const row = el("tr", { "data-stage": stage },
+      el("th", { scope: "row" }, STAGE_WORDS[stage] ?? stage), el("td", {}, canvas),
+      el("td", { class: "number" }, "–"), el("td", { class: "number" }, "–"), el("td", { class: "number" }, "–"));
+    $("#latency").append(row);
+    latencyRows.set(stage, row);
+    sparks.set(stage, new Sparkline(canvas));
+  }
+}
+
+function takeTrend(points) {
+  const last = trend.length ? trend[trend.length - 1].unix_s : -Infinity;
+  trend.push(...points.filter((point) => point.unix_s > last));
+  while (trend.length > 120) trend.shift();
+  hello?.stages.forEach((stage, i) => sparks.get(stage).show(trend.map(({ unix_s, p50, p95 }) => [unix_s, p50[i], p95[i]])));
+}
+
+connect();

@@ -3,5 +3,5 @@
 const next = location.pathname === "/login" ? "/" : location.pathname;
 document.getElementById("next").value = next;
 document.getElementById("token").focus();
-const answer = await fetch("/session", { headers: { Accept: "text/plain" } }).catch(() => null);
-if (answer && answer.status === 204) location.replace(next);
+const answer = await fetch("/session").catch(() => null);
+if (answer?.ok && (await answer.json()).let_in) location.replace(next);

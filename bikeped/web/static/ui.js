@@ -88,8 +88,9 @@ export const metres = (value, digits = 1) => fixed(value, digits, "\u00a0m");
 export const seconds = (value, digits = 1) => fixed(value, digits, "\u00a0s");
 export const millis = (value, digits = 0) => fixed(value, digits, "\u00a0ms");
 export const speed = (value, digits = 1) => fixed(value, digits, "\u00a0m/s");
+export const count = (number, what) => `${number}\u00a0${what}${number === 1 ? "" : "s"}`;
 export const percent = (value, digits = 1) => known(value) ? `${(100 * value).toFixed(digits)}\u00a0%` : "–";
-export const clock = (time) => new Date(time).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+export const clock = (time) => new Date(time).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit", hour12: false });
 export function duration(value) {
   if (!known(value)) return "–";
   const s = Math.floor(value), d = Math.floor(s / 86400), h = Math.floor(s / 3600) % 24, m = Math.floor(s / 60) % 60;

@@ -1,0 +1,45 @@
+"""`--web [HOST:]PORT`: look at a replay in the browser while it runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from bikeped.config import LoadedConfig
+from bikeped.errors import BikepedError
+
+if TYPE_CHECKING:
+    from bikeped.web.service import ServicePages
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_PLACE = re.compile(r"(?:(?P<host>\[[^\]]+\]|[^:\[\]]+):)?(?P<port>\d{1,5})")
+
+
+def web_option(command: F) -> F:
+    """Adds `--web`; the parameter is `web_place`."""
+    return click.option(
+        "--web",
+        "web_place",
+        metavar="[HOST:]PORT",
+        help="Serve the live page while it runs, at the recording's own pace; e.g. 8080.",
+    )(command)
+
+
+def web_overrides(place: str) -> tuple[str, ...]:
+    """`--web`'s value as overrides of the configuration; BikepedError when it is no address."""
+    found = _PLACE.fullmatch(place.strip())
+    if found is None:
+        raise BikepedError(f"--web {place}: is not [HOST:]PORT; give e.g. 8080 or 127.0.0.1:8080")
+    host = (found["host"] or "127.0.0.1").strip("[]")
+    return ("web.enabled=true", f"web.host={host!r}", f"web.port={int(found['port'])}")
+
+
+def open_pages(loaded: LoadedConfig) -> ServicePages:
+    """The pages of a service or a replay; ConfigError when others could see them unasked."""
+    from bikeped.web.service import ServicePages
+
+    return ServicePages(loaded)

@@ -1,0 +1,114 @@
+"""What the tests of the pages share: accesses, a small service's inside, outcomes to show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import simplejpeg
+from prometheus_client import CollectorRegistry
+
+from bikeped.config import LoadedConfig, parse_config
+from bikeped.service.judge import Judge
+from bikeped.service.loop import Outcome
+from bikeped.service.pages import Inside
+from bikeped.service.vision import Picture
+from bikeped.telemetry.messages import Counters, HealthMessage, Part, health_message
+from bikeped.telemetry.mqtt import MqttStatus
+from bikeped.types import Colour, Detections, Frame, Kind, Signal
+from bikeped.web.security import Access
+
+#: Sizes to look at: a phone held upright, a projector.
+PHONE = {"width": 390, "height": 844}
+DESKTOP = {"width": 1440, "height": 900}
+
+TOKEN = "a-long-enough-token"
+OPEN = Access(frozenset({"localhost", "127.0.0.1", "::1"}))
+LOCKED = Access(frozenset({"localhost", "127.0.0.1", "::1"}), token=TOKEN)
+
+CONFIG = """
+camera: {width: 960, height: 640, projection: perspective, pad_size: null, crop_size: null,
+         radius_px: 580, fov_deg: 73, height_m: 5.0, pitch_deg: -35}
+web: {enabled: true, port: 0}
+"""
+
+SIGNALS = {
+    "IDLE": Signal("IDLE", Colour.BLUE),
+    "SAFE": Signal("SAFE", Colour.GREEN),
+    "WARNING": Signal("WARNING", Colour.ORANGE),
+    "ALERT": Signal("ALERT", Colour.RED, blink_hz=2.0),
+    "FAULT": Signal("FAULT", Colour.ORANGE, 0.5, faults=("camera: no frame for 2.0 s",)),
+    "OFF": Signal("OFF", Colour.OFF),
+}
+
+
+def small(*overrides: str) -> LoadedConfig:
+    return parse_config(CONFIG, "small.yaml", Path(), overrides)
+
+
+def inside(loaded: LoadedConfig | None = None, mqtt: MqttStatus | None = None) -> Inside:
+    """A service's inside without a service."""
+    loaded = loaded or small()
+    return Inside(
+        loaded=loaded,
+        judge=Judge(loaded),
+        source="drawn.avi",
+        detector="drawn",
+        health=health,
+        metrics=CollectorRegistry(),
+        mqtt=None if mqtt is None else lambda: mqtt,
+    )
+
+
+def health(**changes: Any) -> HealthMessage:
+    values: dict[str, Any] = {
+        "unix_s": 1.7e9,
+        "state": "SAFE",
+        "version": "0.1",
+        "config_hash": "abc",
+        "uptime_s": 3725.0,
+        "fps": 29.9,
+        "latency_ms": {"total": {"p50": 12.0, "p95": 20.0, "p99": 30.0, "max": 44.0}},
+        "camera": Part(ok=True, detail="frames arrive"),
+        "capture_age_ms": 23.0,
+        "detector": Part(ok=True, detail="answers"),
+        "light": Part(ok=True, detail="simulated"),
+        "faults": (),
+        "counters": Counters(
+            frames=100, dropped=2, undecodable=1, alerts=1, mqtt_dropped=0, audit_dropped=0
+        ),
+    }
+    return health_message(**{**values, **changes})
+
+
+def picture(grey: int = 90, width: int = 960, height: int = 640) -> bytes:
+    """A JPEG of one grey."""
+    rgb = np.full((height, width, 3), grey, np.uint8)
+    jpeg: bytes = simplejpeg.encode_jpeg(rgb, colorspace="RGB")
+    return jpeg
+
+
+class Scene:
+    """Outcomes of a pedestrian who stands and a cyclist who comes nearer, a frame at a time."""
+
+    def __init__(self, judge: Judge) -> None:
+        self.judge = judge
+        self.number = 0
+
+    def next(self, signal: str = "SAFE", grey: int | None = None) -> Outcome:
+        n = self.number
+        self.number += 1
+        detections = Detections(
+            np.array([Kind.PEDESTRIAN, Kind.CYCLIST], np.int8),
+            np.full(2, 0.9, np.float32),
+            np.array([[400, 250, 440, 330], [700 - 12 * n, 260, 780 - 12 * n, 340]], np.float32),
+        )
+        captured_s = 10.0 + n / 30
+        frame = Frame(
+            n, captured_s, 960, 640, jpeg=picture(60 + 7 * n % 120 if grey is None else grey)
+        )
+        judgement = self.judge.judge(detections, 960, 640, captured_s, 0.0)
+        latency = {"acquire": 1.0, "inference": 9.0 + n % 3, "total": 12.0, "capture_age": 13.0}
+        seen = Picture(frame, np.zeros((1, 1, 3), np.uint8), 0.0, 1.0, 1.0)
+        return Outcome(seen, n / 30, detections, judgement, SIGNALS[signal], latency)
