@@ -1,0 +1,167 @@
+"""`bikeped testbench`: the browser test bench, challenges on the command line, and the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from rich.markup import escape
+
+from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
+from bikeped.cli.conformance_shared import scenarios_option
+from bikeped.cli.governance_tables import print_contest
+from bikeped.cli.guard import guarded
+from bikeped.config import LoadedConfig, load_config
+from bikeped.conformance.scenario import Scenario, bundled_folder, load_scenarios
+from bikeped.errors import BikepedError
+from bikeped.files import write_whole
+
+
+@click.group("testbench", invoke_without_command=True)
+@config_options
+@scenarios_option
+@click.option("--port", type=click.IntRange(0, 65535), help="Port to serve; 0: any free one.")
+@click.option("--host", help="Address to serve; any but this machine's own needs web.token_file.")
+@click.pass_context
+@guarded
+def command(
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    port: int | None,
+    host: str | None,
+) -> None:
+    """Serve the test bench: see why the light goes red, change anything, contest it.
+
+    It computes with the deployed code and touches no running service.
+    """
+    context = click.get_current_context()
+    if context.invoked_subcommand is not None:
+        if config_path or overrides or scenarios_dir or port is not None or host:
+            raise BikepedError(
+                f"testbench: write options behind the command: bikeped testbench "
+                f"{context.invoked_subcommand} ... -c FILE"
+            )
+        return
+    import msgspec
+
+    from bikeped.web.serve import serve_pages
+    from bikeped.web.testbench import add_testbench
+    from bikeped.web.testbench_contest import Origin
+
+    loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
+    web = loaded.config.web
+    if port is not None:
+        web = msgspec.structs.replace(web, port=port)
+    if host is not None:
+        web = msgspec.structs.replace(web, host=host)
+    origin = Origin(config_path, scenarios_dir)
+    screen = console()
+    serve_pages(
+        web,
+        lambda app: add_testbench(app, loaded, scenarios, origin),
+        announce=lambda url: screen.print(
+            f"Test bench: {escape(url)}testbench (Ctrl-C ends it)", soft_wrap=True
+        ),
+        base_dir=loaded.base_dir,
+        source=loaded.source,
+    )
+
+
+@command.command("contest")
+@click.argument("challenge", metavar="FILE_OR_LINK")
+@config_options
+@scenarios_option
+@json_option
+@guarded
+def contest(
+    challenge: str,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    json_path: str | None,
+) -> None:
+    """Rerun a challenge that the test bench saved: the whole suite, before and after.
+
+    FILE_OR_LINK is the file, or the page's address with all that follows its #.
+    """
+    from bikeped.web.testbench_contest import challenge as run
+    from bikeped.web.testbench_run import Workbench, trial_summaries
+    from bikeped.web.testbench_settings import in_force, parse_link
+
+    loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
+    if Path(challenge).is_file() or not ("#" in challenge or "=" in challenge):
+        bench = _read(Path(challenge))
+    else:
+        bench = parse_link(challenge, in_force(loaded))
+    work = Workbench(loaded, scenarios)
+    found = run(work, bench).as_dict()
+    trials = trial_summaries(work.whole(bench), bench)
+    words = "bikeped testbench contest " + challenge
+    if json_path is not None:
+        write_json({"command": words, **found, "trials": trials}, json_path)
+    print_contest(found, words, json_path)
+    if trials is not None:
+        mean = trials["sensitivity"]
+        if mean["mean"] is not None:
+            console(json_path).print(
+                f"Over {trials['trials']} trials of misses: sensitivity {100 * mean['mean']:.1f} %."
+            )
+
+
+@command.command("export")
+@click.argument("out", type=click.Path(path_type=Path, dir_okay=False), metavar="REPORT.html")
+@config_options
+@scenarios_option
+@json_option
+@guarded
+def export(
+    out: Path,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    scenarios_dir: Path | None,
+    json_path: str | None,
+) -> None:
+    """Write one self-contained page: every scenario's playback, figures, gates, residual risks.
+
+    It opens from the disk without a network, to be mailed or printed.
+    """
+    from bikeped.web.export import make_report
+
+    loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
+    with progress_bar("scenarios", len(scenarios)) as tell:
+        page = make_report(loaded, scenarios, _again(config_path, overrides, scenarios_dir), tell)
+    write_whole(out, page)
+    size_mb = len(page.encode()) / 1e6
+    if json_path is not None:
+        write_json({"file": str(out), "scenarios": len(scenarios), "size_mb": size_mb}, json_path)
+    console(json_path).print(f"{escape(str(out))}: {len(scenarios)} scenarios, {size_mb:.1f} MB")
+
+
+def _begin(
+    config_path: Path | None, overrides: tuple[str, ...], scenarios_dir: Path | None
+) -> tuple[LoadedConfig, list[Scenario]]:
+    loaded = load_config(config_path, overrides)
+    return loaded, load_scenarios(scenarios_dir or bundled_folder())
+
+
+def _read(path: Path) -> object:
+    from bikeped.web.testbench_settings import parse_file
+
+    try:
+        if path.stat().st_size > 1_000_000:
+            raise BikepedError(f"{path}: larger than 1 MB; a challenge is a short text")
+        return parse_file(path.read_bytes(), str(path))
+    except OSError as error:
+        raise BikepedError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+
+
+def _again(config_path: Path | None, overrides: tuple[str, ...], scenarios_dir: Path | None) -> str:
+    import shlex
+
+    words = ["bikeped", "testbench", "export", "report.html"]
+    words += ["-c", str(config_path)] if config_path is not None else []
+    words += ["--scenarios", str(scenarios_dir)] if scenarios_dir is not None else []
+    for item in overrides:
+        words += ["--set", item]
+    return shlex.join(words)

@@ -1,0 +1,142 @@
+// The whole suite, before and after: gates, figures, every scenario as a strip, and how to repeat it.
+
+import { canvasOf, colour, el, fixed, percent, seconds } from "/static/ui.js";
+import { NAMES } from "/static/testbench-words.js";
+
+const FIGURES = [
+  ["sensitivity", "Sensitivity", percent, 1], ["specificity", "Specificity", percent, 1],
+  ["mean_warning_budget_s", "Mean warning budget", (v) => seconds(v, 2), 1],
+  ["contact_sensitivity", "Contact sensitivity", percent, 1], ["sev_fn", "Missed severity (SevFN)", percent, -1],
+  ["fatigue", "Fatigue (share of time red)", percent, -1], ["mean_alert_latency_s", "Mean alert latency", (v) => seconds(v, 2), -1],
+  ["false_episodes_per_hour", "False episodes an hour", (v) => fixed(v, 1), -1],
+];
+
+// `actions` = {open(name), save(), link()}
+export function suitePanel(host, actions) {
+  return (data, trials) => {
+    const changed = data.changes.length > 0;
+    host.replaceChildren(
+      el("div", { class: "su-top" }, gates(data, changed), figures(data, changed, trials), repeat(data, changed, actions)),
+      strips(data, changed, actions),
+    );
+  };
+}
+
+function verdict(side) {
+  const failed = side.gates.filter((gate) => !gate.holds).map((gate) => gate.name.toLowerCase());
+  return failed.length ? `fails: ${failed.join(", ")}` : "holds all gates";
+}
+
+function gates(data, changed) {
+  const { before, after } = data;
+  const row = (gate, i) => el("tr", {},
+    el("th", { scope: "row" }, gate.name), el("td", { class: "number" }, gate.rule),
+    changed ? el("td", { class: "number" }, mark(before.gates[i])) : null,
+    el("td", { class: "number" }, mark(gate)));
+  return el("div", { class: "su-gates" },
+    el("p", { class: "su-verdict", "data-holds": after.promotable }, changed ? `With your changes the configuration ${verdict(after)}.` : `The configuration in force ${verdict(after)}.`),
+    changed ? el("p", { class: "note" }, `Before, it ${before.promotable ? "held all gates" : `failed: ${before.gates.filter((g) => !g.holds).map((g) => g.name.toLowerCase()).join(", ")}`}.`) : null,
+    el("table", {},
+      el("caption", {}, `Deployment gates over ${after.scenarios} scenarios`),
+      el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Gate"), el("th", { scope: "col", class: "number" }, "required"), changed ? el("th", { scope: "col", class: "number" }, "before") : null, el("th", { scope: "col", class: "number" }, changed ? "after" : "measured"))),
+      el("tbody", {}, after.gates.map(row))));
+}
+
+const mark = (gate) => el("span", { class: gate.holds ? "ok-mark" : "bad-mark" }, gate.shown, el("span", { class: "unseen" }, gate.holds ? " holds" : " fails"));
+
+function figures(data, changed, trials) {
+  const cell = (side, key, say) => say(side.totals[key]);
+  const head = ["Figure", ...(changed ? ["before", "after", "change"] : ["measured"]), ...(trials ? [`mean of ${trials.trials} trials`] : [])];
+  return el("div", { class: "su-figures scroll" }, el("table", {},
+    el("caption", {}, "Figures over all frames of the suite"),
+    el("thead", {}, el("tr", {}, head.map((text, i) => el("th", { scope: "col", class: i ? "number" : "" }, text)))),
+    el("tbody", {}, FIGURES.map(([key, name, say, better]) => {
+      const a = data.before.totals[key], b = data.after.totals[key];
+      const difference = a === null || b === null ? null : b - a;
+      const worse = difference !== null && Math.abs(difference) > 5e-4 && Math.sign(difference) !== better;
+      const unit = say === percent ? `${(100 * difference).toFixed(1)}\u00a0pp` : difference?.toFixed(2);
+      const small = difference === null || Math.abs(difference) < 5e-4;
+      const told = trials?.[key];
+      return el("tr", {}, el("th", { scope: "row" }, name),
+        changed ? el("td", { class: "number" }, cell(data.before, key, say)) : null,
+        el("td", { class: "number" }, cell(data.after, key, say)),
+        changed ? el("td", { class: `number ${small ? "" : worse ? "bad-mark" : "ok-mark"}` }, small ? "–" : `${difference > 0 ? "+" : "−"}${unit.replace("-", "")}`) : null,
+        trials ? el("td", { class: "number" }, told.mean === null ? "–" : told.low === null ? say(told.mean) : `${say(told.mean)} (${say(told.low)} to ${say(told.high)})`) : null);
+    }))));
+}
+
+function repeat(data, changed, actions) {
+  const list = data.changes.map(({ key, before, after }) => el("li", {}, el("code", {}, key.replace("danger.", "truth.")), ` ${word(before)} → `, el("b", {}, word(after))));
+  return el("div", { class: "su-repeat" },
+    el("h3", {}, changed ? "Your challenge" : "Nothing is contested yet"),
+    changed ? el("ul", { class: "su-changes" }, list) : el("p", { class: "note" }, "Move a slider, or draw a path: the suite runs again, and here is what it changes."),
+    changed ? el("div", { class: "row" },
+      el("button", { type: "button", class: "small primary", onclick: actions.save }, "Save as a file"),
+      el("button", { type: "button", class: "small", onclick: actions.link }, "Copy link")) : null,
+    el("label", { class: "button small" }, "Open a challenge", el("input", { type: "file", class: "unseen", id: "open-challenge", accept: ".json,application/json", onchange: actions.load })),
+    changed ? el("div", {}, el("p", { class: "note" }, "The very same numbers on any computer:"),
+      el("pre", { tabindex: 0, "aria-label": "Command line" }, `bikeped testbench contest challenge.json${data.command ? `\n${data.command}` : ""}`)) : null);
+}
+
+function word(value) {
+  if (value === null) return "none";
+  if (typeof value === "object") return Object.values(value).map((v) => Math.round(v * 100) / 100).join(", ");
+  return typeof value === "number" ? String(Math.round(value * 1e6) / 1e6) : String(value);
+}
+
+function strips(data, changed, actions) {
+  const different = new Map(data.changed.map((entry) => [entry.scenario, entry]));
+  const rows = data.strips.map((strip) => {
+    const entry = different.get(strip.name);
+    const after = data.after.by_scenario[strip.name], before = data.before.by_scenario[strip.name];
+    const canvas = el("canvas", { class: "su-strip", role: "img", "aria-label": stripWords(strip, entry) });
+    const values = (key, say) => {
+      const now = say(after[key]), then = before ? say(before[key]) : "–";
+      return changed && now !== then ? [el("s", { class: "su-was" }, then), " ", el("b", {}, now)] : now;
+    };
+    const row = el("tr", { class: entry ? "differs" : "" },
+      el("th", { scope: "row" }, el("button", { type: "button", class: "su-open", onclick: () => actions.open(strip.name) }, strip.name), entry ? el("span", { class: "su-note" }, entry.frames_state === undefined ? entry.what : `${entry.frames_state} frames differ`) : null),
+      el("td", { class: "su-cell" }, canvas),
+      el("td", { class: "number" }, values("sensitivity", (v) => percent(v, 0))),
+      el("td", { class: "number" }, values("specificity", (v) => percent(v, 0))),
+      el("td", { class: "number" }, values("min_warning_budget_s", (v) => seconds(v, 2))));
+    canvasOf(canvas, (context, width, height) => drawStrip(context, width, height, strip, changed));
+    return row;
+  });
+  const order = changed ? [...rows].sort((a, b) => b.classList.contains("differs") - a.classList.contains("differs")) : rows;
+  return el("div", { class: "scroll" }, el("table", { class: "su-table" },
+    el("caption", {}, changed ? `${different.size} of ${data.strips.length} scenarios change. Each strip: danger above, states below, before (pale) over after.` : "Each strip: danger above, states below; the higher, the more urgent."),
+    el("thead", {}, el("tr", {}, ["Scenario", "Over time", "Sensitivity", "Specificity", "Least budget"].map((text, i) => el("th", { scope: "col", class: i > 1 ? "number" : "" }, text)))),
+    el("tbody", {}, order)));
+}
+
+function stripWords(strip, entry) {
+  const total = strip.frames;
+  const share = (runs, code) => Math.round(100 * runs.filter(([c]) => c === code).reduce((sum, [, n]) => sum + n, 0) / total);
+  return `${strip.name}: alert ${share(strip.after, 3)} % of the time${strip.before ? `, before ${share(strip.before, 3)} %` : ""}; danger ${share(strip.truth, 1) + share(strip.truth, 2)} %${entry ? "; changed" : ""}`;
+}
+
+export function drawStrip(context, width, height, strip, both) {
+  const x = (f) => f / strip.frames * width;
+  const lane = (runs, top, tall, heights, paint, alpha = 1) => {
+    let at = 0;
+    context.globalAlpha = alpha;
+    for (const [code, count] of runs) {
+      const part = heights[code];
+      context.fillStyle = paint(code);
+      if (part) context.fillRect(x(at), top + tall * (1 - part), Math.max(x(at + count) - x(at), 0.75), tall * part);
+      at += count;
+    }
+    context.globalAlpha = 1;
+  };
+  const state = (code) => colour(`--${NAMES[code].toLowerCase()}`);
+  const steps = [0.2, 0.4, 0.65, 1];
+  lane(strip.truth, 0, 5, [0, 1, 1], (code) => colour(code === 1 ? "--actionable" : "--imminent"));
+  context.fillStyle = colour("--line");
+  context.fillRect(0, 5, width, 1);
+  if (both && strip.before) {
+    const tall = (height - 9) / 2;
+    lane(strip.before, 7, tall, steps, state, 0.45);
+    lane(strip.after, 9 + tall, tall, steps, state);
+  } else lane(strip.after, 7, height - 7, steps, state);
+}

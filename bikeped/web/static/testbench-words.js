@@ -1,0 +1,105 @@
+// What the pages say in words, and how they read a playback. No rule lives here: every number and
+// every passed test comes from the deployed Python code.
+
+import { metres, seconds } from "/static/ui.js";
+
+export const NAMES = ["IDLE", "SAFE", "WARNING", "ALERT"];
+export const LIGHT = { IDLE: "blue", SAFE: "green", WARNING: "yellow", ALERT: "red" };
+export const TIERS = ["none", "actionable", "imminent"];
+
+// Names of configurations as people read them.
+export function configurationName(name, short = false) {
+  const words = {
+    bench: ["your numbers", "The bench’s numbers"], configured: ["in force", "In force on this box"],
+    selected: ["selected", "Selected (the paper’s)"], conservative: ["conservative", "Conservative"],
+    narrow: ["narrow", "Narrow"], speed_adaptive: ["speed-adaptive", "Speed-adaptive"],
+    distance_only: ["distance only", "Distance only"], naive_closing: ["naive closing", "Naive closing"],
+    ttc: ["time to collision", "Time to collision"],
+  };
+  return (words[name] ?? [name, name])[short ? 0 : 1];
+}
+
+export const stateAt = (side, frame) => NAMES[side.state[frame]];
+
+// A pair of a frame by its place in the side's lists, with the tests it passes by name.
+export function pairAt(play, side, at) {
+  if (at < 0 || at === undefined) return null;
+  const pairs = side.pairs;
+  const passes = Object.fromEntries(play.tests.map((test, bit) => [test, (pairs.passes[at] >> bit & 1) === 1]));
+  const pick = (key) => pairs[key][at];
+  return {
+    cyclist: pick("cyclist"), pedestrian: pick("pedestrian"), passes, distance: pick("distance_m"),
+    then: pick("then_m"), lookback: pick("lookback_s"), moved: pick("displacement_m"),
+    speed: pick("speed_mps"), dMax: pick("d_max_m"), reach: pick("reach_m"),
+  };
+}
+
+export const chosenPair = (play, side, frame) => pairAt(play, side, side.chosen[frame]);
+
+// All pairs of a frame.
+export function pairsAt(play, side, frame) {
+  const found = [];
+  for (let at = side.pairs.start[frame]; at < side.pairs.start[frame + 1]; at++) found.push({ at, ...pairAt(play, side, at) });
+  return found;
+}
+
+// The tracks of a frame: id, kind, x, y.
+export function tracksAt(play, frame) {
+  const { start, id, kind, xy } = play.tracks;
+  const found = [];
+  for (let row = start[frame]; row < start[frame + 1]; row++) found.push({ id: id[row], kind: kind[row], x: xy[2 * row], y: xy[2 * row + 1] });
+  return found;
+}
+
+// Why the light shows what it shows, for somebody who has never heard of the rule.
+export function headline(play, side, frame) {
+  const state = stateAt(side, frame);
+  const people = side.pedestrians[frame] === 1 ? "Somebody is" : `${side.pedestrians[frame]} people are`;
+  const start = `The light is ${LIGHT[state]}: `;
+  if (state === "IDLE") return `${start}nobody on foot is in sight.`;
+  const since = side.since_cyclist_s[frame];
+  if (state === "SAFE") return `${start}${people.toLowerCase()} on foot, and no cyclist has been here for ${since === null ? "a while" : seconds(since)}.`;
+  const pair = chosenPair(play, side, frame);
+  if (!pair) return `${start}${people.toLowerCase()} on foot, and a cyclist was here ${seconds(since)} ago.`;
+  const apart = metres(pair.distance);
+  const rule = side.decision.rule;
+  if (state === "ALERT") {
+    if (rule === "distance") return `${start}a cyclist and a pedestrian are only ${apart} apart.`;
+    if (rule === "ttc") return `${start}a cyclist and a pedestrian, ${apart} apart, would meet within ${seconds(side.decision.ttc_s, 0)}.`;
+    return `${start}a cyclist and a pedestrian are ${apart} apart and getting closer.`;
+  }
+  return `${start}a cyclist and a pedestrian are here, ${apart} apart, but ${whyNot(side, pair)}.`;
+}
+
+function whyNot(side, pair) {
+  const { passes } = pair;
+  if (!passes.far_enough) return "too near for a warning still to help";
+  if (!passes.near_enough) return "too far apart to matter yet";
+  if (!passes.in_range) return "too far from the camera to be judged";
+  if (!passes.judged) return "one of them has only just appeared";
+  if (side.decision.rule === "ttc") return passes.closing ? "they would not meet soon" : "not getting closer";
+  if (!passes.closing) return "not getting closer";
+  return "the cyclist hardly moves";
+}
+
+// Was it right? The truth of the frame beside the state.
+export function judgement(play, side, frame) {
+  const tier = TIERS[play.truth.tier[frame]];
+  const alert = stateAt(side, frame) === "ALERT";
+  const ttc = play.truth.ttc_s[frame];
+  const contact = ttc === null ? "they will pass close to one another" : `contact in ${seconds(ttc)}`;
+  if (tier === "actionable") {
+    return alert
+      ? { good: true, word: "Warned in time", why: `Danger: ${contact}, and a warning still helps.` }
+      : { good: false, word: "Missed", why: `Danger: ${contact}. A warning would still help, and there is none.` };
+  }
+  if (tier === "imminent") return { good: alert, word: alert ? "Warned, but late" : "Too late to warn", why: `Danger: ${contact}, sooner than a distracted person can react.`, neutral: true };
+  return alert
+    ? { good: false, word: "Alert without danger", why: "By the ground truth nobody is in danger now." }
+    : { good: true, word: "Rightly quiet", why: "By the ground truth nobody is in danger now." };
+}
+
+// The time in words, for screen readers.
+export function spoken(play, side, frame) {
+  return `${(frame / play.fps).toFixed(2)} seconds. ${headline(play, side, frame)} ${judgement(play, side, frame).word}.`;
+}

@@ -1,0 +1,281 @@
+"""`/testbench`: the simulation behind a page. The page draws; every number is computed here, by the
+deployed rule and the conformance code.
+
+Requests are JSON: a whole `Bench` and, to order them, the page's own number. One answer is computed
+at a time, in a thread; of a page's waiting requests only the newest is answered (the others get
+status 409), and of many pages' only so many wait (503).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from aiohttp import web
+from msgspec import Meta
+
+from bikeped import __version__
+from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.config.provenance import DECIDING_CODE, code_hash
+from bikeped.config.section import Section
+from bikeped.conformance.optimizer import BOUNDS
+from bikeped.conformance.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
+from bikeped.conformance.suite import CONFIGURATIONS, Suite
+from bikeped.web.server import Page, add_page, json_answer, json_body
+from bikeped.web.testbench_contest import Origin, contest_answer
+from bikeped.web.testbench_playback import TESTS, TIERS, coverage, playback
+from bikeped.web.testbench_run import Workbench, trial_summaries
+from bikeped.web.testbench_settings import (
+    MAX_SCRIPT_CHARS,
+    Bench,
+    check_bench,
+    in_force,
+    link_of,
+    parse_file,
+    parse_link,
+    parse_own,
+)
+
+T = TypeVar("T")
+
+_MOST_WAITING = 16
+PAGE = Page(
+    "/testbench",
+    "Test bench",
+    "Test bench",
+    "testbench.html",
+    scripts=("testbench.js",),
+    styles=("testbench.css",),
+)
+
+
+class Ask(Section, frozen=True):
+    """A request about a bench. `client` tells pages apart."""
+
+    bench: Bench
+    client: Annotated[str, Meta(max_length=40)] = ""
+
+
+class Text(Section, frozen=True):
+    """A text that somebody brought: a scenario file, a challenge, a link."""
+
+    text: Annotated[str, Meta(max_length=900_000)]
+    name: Annotated[str, Meta(max_length=120)] = "file"
+
+
+def add_testbench(
+    app: web.Application,
+    loaded: LoadedConfig,
+    scenarios: Sequence[Scenario],
+    origin: Origin = Origin(),  # noqa: B008 - immutable
+) -> None:
+    """Adds the page and its API; `loaded` is the configuration in force, `scenarios` the suite."""
+    work, desk = Workbench(loaded, scenarios), Desk()
+    named = configurations(loaded)
+    about = msgspec.json.encode(describe(work, named))
+
+    async def tell(_request: web.Request) -> web.Response:
+        return web.Response(body=about, content_type="application/json")
+
+    async def ask(request: web.Request, answer: Callable[[Ask], Any]) -> web.Response:
+        found = await json_body(request, Ask)
+        check_bench(found.bench)
+        kind = request.path.rsplit("/", 1)[-1]
+        body = await desk.ask(f"{found.client} {kind}", lambda: msgspec.json.encode(answer(found)))
+        return web.Response(
+            body=body, content_type="application/json", headers={"Cache-Control": "no-store"}
+        )
+
+    async def scenario(request: web.Request) -> web.Response:
+        return await ask(request, lambda found: scenario_answer(work, found, named))
+
+    async def suite(request: web.Request) -> web.Response:
+        return await ask(request, lambda found: contest_answer(work, found.bench, origin))
+
+    async def trials(request: web.Request) -> web.Response:
+        return await ask(
+            request,
+            lambda found: {"trials": trial_summaries(work.whole(found.bench), found.bench)},
+        )
+
+    async def read_scenario(request: web.Request) -> web.Response:
+        found = await json_body(request, Text)
+        if len(found.text) > MAX_SCRIPT_CHARS:
+            raise web.HTTPRequestEntityTooLarge(MAX_SCRIPT_CHARS, len(found.text))
+        one = await asyncio.to_thread(parse_own, found.text, found.name)
+        return json_answer({"script": script(one), "text": dump_scenario(one)})
+
+    async def read_challenge(request: web.Request) -> web.Response:
+        found = await json_body(request, Text)
+        base = in_force(loaded)
+        if found.text.lstrip().startswith("{"):
+            bench = parse_file(found.text, found.name)
+        else:
+            bench = parse_link(found.text, base)
+        return json_answer({"bench": bench, "link": link_of(bench, base)})
+
+    add_page(app, PAGE)
+    app.router.add_get("/testbench/about", tell)
+    app.router.add_post("/testbench/scenario", scenario)
+    app.router.add_post("/testbench/suite", suite)
+    app.router.add_post("/testbench/trials", trials)
+    app.router.add_post("/testbench/read-scenario", read_scenario)
+    app.router.add_post("/testbench/read-challenge", read_challenge)
+
+
+def configurations(loaded: LoadedConfig) -> dict[str, DecisionConfig]:
+    """The configuration in force, where it is none of the named, and those."""
+    if loaded.config.decision in CONFIGURATIONS.values():
+        return dict(CONFIGURATIONS)
+    return {"configured": loaded.config.decision, **CONFIGURATIONS}
+
+
+def scenario_answer(
+    work: Workbench, asked: Ask, named: dict[str, DecisionConfig]
+) -> dict[str, Any]:
+    """The playback of the scenario shown, for the bench's decision and those beside it."""
+    bench = asked.bench
+    suite = work.only(bench)
+    name = next((n for n, d in named.items() if d == bench.decision), "bench")
+    sides = {name: bench.decision}
+    for name in bench.beside:
+        if name in named:
+            sides[name] = named[name]
+    views = [coverage(suite.camera, pose) for pose in suite.poses]
+    return {
+        **playback(suite, 0, sides),
+        "cameras": views,
+        "link": link_of(bench, in_force(work.loaded)),
+        "script": script(suite.scenarios[0]),
+    }
+
+
+def script(scenario: Scenario) -> dict[str, Any]:
+    """A scenario as the editor holds it."""
+    return {
+        "name": scenario.name,
+        "hazard": scenario.hazard,
+        "expected": scenario.expected,
+        "vehicle": scenario.vehicle,
+        "story": scenario.story,
+        "agents": [
+            {
+                "id": a.id,
+                "kind": a.kind,
+                "path": a.path.tolist(),
+                **({} if a.size_m == SIZES_M[a.kind] else {"size": _size(a.size_m)}),
+            }
+            for a in scenario.agents
+        ],
+    }
+
+
+def _size(size_m: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip(("length", "width", "height"), size_m, strict=True))
+
+
+def describe(work: Workbench, named: dict[str, DecisionConfig]) -> dict[str, Any]:
+    """What the page needs once: scenarios, configurations, ranges, and which code decides."""
+    base = in_force(work.loaded)
+    suite: Suite = work.whole(base)
+    return {
+        "version": __version__,
+        "rule_hash": code_hash(DECIDING_CODE),
+        "suite_hash": suite.hash,
+        "config_hash": work.loaded.hash,
+        "base": base,
+        "link": link_of(base, base),
+        "configurations": named,
+        "in_force": next(n for n, d in named.items() if d == base.decision),
+        "tests": TESTS,
+        "tiers": TIERS,
+        "hazards": HAZARDS,
+        "kinds": SIZES_M,
+        "search": {b.key: [b.low, b.high] for b in BOUNDS},
+        "ranges": ranges(),
+        "scenarios": [
+            {
+                "name": s.name,
+                "hazard": s.hazard,
+                "story": s.story,
+                "duration_s": s.duration_s,
+                "agents": len(s.agents),
+            }
+            for s in work.scenarios
+        ],
+    }
+
+
+def ranges() -> dict[str, Any]:
+    """Every number's bounds and meaning, by key: what `Bench` itself checks."""
+    schema = msgspec.json.schema(Bench)["$defs"]
+    found: dict[str, Any] = {}
+    for section, name in (
+        ("camera", "Mount"),
+        ("decision", "DecisionConfig"),
+        ("perception", "Perception"),
+        ("delay", "Delay"),
+        ("danger", "Danger"),
+    ):
+        for key, told in schema[name]["properties"].items():
+            found[f"{section}.{key}"] = {
+                "low": told.get("minimum", told.get("exclusiveMinimum")),
+                "high": told.get("maximum"),
+                "meaning": told.get("description", ""),
+                "whole": told.get("type") == "integer",
+            }
+    return found
+
+
+class Desk:
+    """One job at a time, in a thread; of each client's waiting jobs only the newest is done."""
+
+    def __init__(self, most_waiting: int = _MOST_WAITING) -> None:
+        self._most = most_waiting
+        self._waiting: OrderedDict[str, asyncio.Future[bool]] = OrderedDict()
+        self._busy = False
+
+    async def ask(self, client: str, job: Callable[[], T]) -> T:
+        """The job's answer. HTTPConflict when a newer one of this client has come meanwhile,
+        HTTPServiceUnavailable when too many wait."""
+        if self._busy:
+            await self._wait(client)
+        self._busy = True
+        task = asyncio.ensure_future(asyncio.to_thread(job))
+        # A client that goes away must not let a second job begin beside the running one.
+        task.add_done_callback(lambda _: self._next())
+        return await asyncio.shield(task)
+
+    async def _wait(self, client: str) -> None:
+        old = self._waiting.pop(client, None)
+        if old is not None and not old.done():
+            old.set_result(False)
+        if len(self._waiting) >= self._most:
+            raise web.HTTPServiceUnavailable(
+                text="Too many runs are waiting: try again in a few seconds.",
+                headers={"Retry-After": "3"},
+            )
+        turn: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+        self._waiting[client] = turn
+        try:
+            mine = await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled() and turn.result():
+                self._next()  # the turn came as the client left: somebody else's, then
+            elif self._waiting.get(client) is turn:
+                del self._waiting[client]
+            raise
+        if not mine:
+            raise web.HTTPConflict(text="A newer request of this page took its place.")
+
+    def _next(self) -> None:
+        self._busy = False
+        while self._waiting:
+            _, turn = self._waiting.popitem(last=False)
+            if not turn.done():
+                self._busy = True  # kept for the one whose turn it is
+                turn.set_result(True)
+                return

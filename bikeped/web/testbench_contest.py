@@ -1,0 +1,163 @@
+"""The whole suite under a challenge, before beside after, with what makes it again.
+
+Before is the configuration in force on the suite as it is; after is the bench. The comparison is
+`conformance.contest`'s; where `bikeped conformance contest` can say the same challenge, its command
+line is told, and gives the same numbers.
+"""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bikeped import __version__
+from bikeped.config import LoadedConfig
+from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
+from bikeped.conformance.contest import Contest, Side, contest
+from bikeped.conformance.gates import check
+from bikeped.web.testbench_run import Workbench
+from bikeped.web.testbench_settings import VIEW, Bench, file_of, in_force, link_of
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the bench was started from: what a command line must repeat."""
+
+    config: Path | None = None
+    scenarios: Path | None = None
+
+    def options(self) -> list[str]:
+        words = ["-c", str(self.config)] if self.config is not None else []
+        return words + (["--scenarios", str(self.scenarios)] if self.scenarios is not None else [])
+
+
+def challenge(work: Workbench, bench: Bench) -> Contest:
+    """Runs both sides."""
+    before = work.whole(in_force(work.loaded))
+    after = before if _same_run(work, bench) else work.whole(bench)
+    return contest(before, work.loaded.config.decision, after, bench.decision)
+
+
+def _same_run(work: Workbench, bench: Bench) -> bool:
+    base = in_force(work.loaded)
+    return msgspec.structs.replace(bench, decision=base.decision, scenario="", beside=()) == base
+
+
+def contest_answer(work: Workbench, bench: Bench, origin: Origin) -> dict[str, Any]:
+    """The contest for the page: figures, gates in words, strips, and how to repeat it."""
+    found = challenge(work, bench)
+    data = found.as_dict()
+    for side, key in ((found.before, "before"), (found.after, "after")):
+        for told, gate in zip(data[key]["gates"], check(side.metrics), strict=True):
+            told["rule"], told["shown"] = gate.rule, gate.say(gate.measured)
+    data["strips"] = [_strip(found, name) for name in found.after.suite.names]
+    base = in_force(work.loaded)
+    data["link"] = link_of(bench, base)
+    data["changes"] = changes(bench, base)
+    data["command"] = command_line(bench, base, origin)
+    data["file"] = file_of(bench, base, facts(work.loaded))
+    return data
+
+
+def facts(loaded: LoadedConfig) -> dict[str, str | None]:
+    """What a challenge was measured with; the same hashes give the same numbers."""
+    return {
+        "version": __version__,
+        "rule_hash": code_hash(DECIDING_CODE),
+        "measuring_hash": code_hash(MEASURING_CODE),
+        "config_hash": loaded.hash,
+        "calibration_hash": loaded.calibration_hash,
+    }
+
+
+def changes(bench: Bench, base: Bench) -> list[dict[str, Any]]:
+    """What the bench sets otherwise than the configuration in force: key, before, after."""
+    now, before = msgspec.to_builtins(bench), msgspec.to_builtins(base)
+    found = []
+    for key, value in now.items():
+        if key == "scripts" or key in VIEW:
+            continue
+        if isinstance(value, dict) and isinstance(before[key], dict):
+            found += [
+                {"key": f"{key}.{k}", "before": before[key][k], "after": v}
+                for k, v in value.items()
+                if v != before[key][k]
+            ]
+        elif value != before[key]:
+            found.append({"key": key, "before": before[key], "after": value})
+    if bench.scripts:
+        count = len(bench.scripts)
+        found.append({"key": "own scenarios", "before": 0, "after": count})
+    return found
+
+
+def command_line(bench: Bench, base: Bench, origin: Origin) -> str | None:
+    """The `bikeped conformance contest` of this challenge; None where that command cannot say it.
+
+    It knows the configuration's keys and the truth's thresholds. What the bench alone has (misses,
+    delay, where the camera stands, own scenarios that are in no file) is repeated by
+    `bikeped testbench contest` with the file or the link.
+    """
+    plain = msgspec.structs.replace
+    said = plain(
+        base,
+        decision=bench.decision,
+        danger=bench.danger,
+        scenario=bench.scenario,
+        beside=bench.beside,
+        camera=plain(
+            base.camera,
+            height_m=bench.camera.height_m,
+            pitch_deg=bench.camera.pitch_deg,
+            fov_deg=bench.camera.fov_deg,
+        ),
+    )
+    different = changes(bench, base)
+    if said != bench or not different:
+        return None
+    words = ["bikeped", "conformance", "contest", *origin.options()]
+    for change in different:
+        section, _, name = change["key"].partition(".")
+        value = change["after"]
+        if section == "danger":
+            words += ["--truth", f"{name}={_word(value)}"]
+        else:
+            words += ["--set", f"{change['key']}={_word(value)}"]
+    return shlex.join(words)
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def _strip(found: Contest, name: str) -> dict[str, Any]:
+    """States and truth of one scenario as runs of equal frames, before and after."""
+    index = found.after.suite.names.index(name)
+    truth = found.after.suite.truths[index]
+    return {
+        "name": name,
+        "hazard": found.after.suite.scenarios[index].hazard,
+        "frames": len(truth.time_s),
+        "truth": runs(truth.danger.astype(int) + truth.imminent),
+        "before": _states(found.before, name),
+        "after": _states(found.after, name),
+    }
+
+
+def _states(side: Side, name: str) -> list[list[int]] | None:
+    return runs(side.states[side.part(name)]) if name in side.suite.names else None
+
+
+def runs(codes: Any) -> list[list[int]]:
+    """[[code, frames], ...] of equal neighbours."""
+    codes = np.asarray(codes)
+    edges = np.nonzero(np.diff(codes, prepend=codes[0] - 1))[0]
+    ends = [*edges[1:].tolist(), len(codes)]
+    return [[int(codes[a]), b - a] for a, b in zip(edges.tolist(), ends, strict=True)]

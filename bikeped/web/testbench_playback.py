@@ -1,0 +1,292 @@
+"""One scenario, frame by frame: what the pages draw. All numbers are the deployed rule's.
+
+Times are frames / 30 s; positions are in the plan (x east, y north, metres), rounded to mm; what is
+not there is null. Arrays run over frames; `start` arrays say where a frame's entries begin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bikeped.config import DecisionConfig, rule_settings
+from bikeped.conformance.experiments import onsets
+from bikeped.conformance.metrics import measure, number
+from bikeped.conformance.simulate import FPS, verdicts
+from bikeped.conformance.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, Truth
+from bikeped.decision import PairVerdicts, chosen_pair, explain, pair_numbers, remembered
+from bikeped.geometry import CameraPose, GroundCamera
+from bikeped.types import BoolArray, FloatArray, Kind, State
+from bikeped.web.testbench_run import BenchSuite
+
+#: Codes of the truth's tiers in `truth.tier`.
+TIERS = ("none", "actionable", "imminent")
+_COVER_BEARINGS = 90
+_COVER_REACH_M = 40.0
+
+
+def playback(
+    suite: BenchSuite, index: int, decisions: Mapping[str, DecisionConfig]
+) -> dict[str, Any]:
+    """Everything about scenario `index`: the plan, what was seen, the truth, and each decision."""
+    scenario, truth = suite.scenarios[index], suite.truths[index]
+    return {
+        "scenario": scenario_facts(suite, index),
+        "frames": len(truth.time_s),
+        "fps": FPS,
+        "agents": _agents(suite, index),
+        "tracks": _tracks(suite, index),
+        "truth": _truth(truth),
+        "closest_s": number(_closest(truth)),
+        "prt_s": {"distracted": PEDESTRIAN_PRT_S, "attentive": ATTENTIVE_PRT_S},
+        "delay_frames": suite.delay.frames,
+        "order": suite.delay.order,
+        "sides": [_side(suite, index, name, d) for name, d in decisions.items()],
+        "expected": scenario.expected,
+        "tests": TESTS,
+    }
+
+
+def scenario_facts(suite: BenchSuite, index: int) -> dict[str, Any]:
+    """What a scenario is, in words."""
+    scenario = suite.scenarios[index]
+    return {
+        "name": scenario.name,
+        "hazard": scenario.hazard,
+        "vehicle": scenario.vehicle,
+        "story": scenario.story,
+        "duration_s": scenario.duration_s,
+    }
+
+
+def coverage(camera: GroundCamera, pose: CameraPose) -> dict[str, Any]:
+    """Where the ground is in the picture: by bearing the nearest and the farthest distance, as two
+    outlines in the plan (null where the ground is not seen), and what the picture is like."""
+    bearing = np.linspace(-np.pi, np.pi, _COVER_BEARINGS, endpoint=False)
+    reach = np.concatenate([np.arange(0.1, 5, 0.1), np.arange(5, _COVER_REACH_M + 0.1, 0.25)])
+    ground = np.stack(
+        [
+            np.cos(bearing)[:, None] * reach,
+            np.sin(bearing)[:, None] * reach,
+        ],
+        -1,
+    )
+    _, seen = camera.project(ground.reshape(-1, 2))
+    seen = seen.reshape(len(bearing), len(reach))
+    some = seen.any(axis=1)
+    near, far = seen.argmax(axis=1), len(reach) - 1 - seen[:, ::-1].argmax(axis=1)
+    step = np.arange(len(bearing))
+
+    def outline(at: Any) -> list[float | None]:
+        world = pose.ground_to_world(ground[step, at])
+        return _flat(np.where(some[:, None], world, np.nan))
+
+    return {
+        "x": pose.x_m,
+        "y": pose.y_m,
+        "heading_deg": pose.heading_deg - camera.heading_deg,
+        "near": outline(near),
+        "far": outline(far),
+        "reach_m": _COVER_REACH_M,
+    }
+
+
+def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
+    """Each agent's true way, and where it was detected in the frame that the tracker gets."""
+    scenario, scene, seen = suite.scenarios[index], suite.scenes_seen[index], suite.seen[index]
+    time_s = suite.truths[index].time_s
+    late = suite.delay.frames
+    found = []
+    for a, agent in enumerate(scenario.agents):
+        xy, heading, _ = agent.sample(time_s)
+        put = np.where(scene.detected[:, a, None], scene.xy_m[:, a], np.nan)
+        detected = np.full_like(put, np.nan)
+        if late < len(put):
+            detected[late:] = suite.pose.ground_to_world(put[: len(put) - late])
+        error = np.hypot(*(put - seen.true_m[:, a]).T)
+        found.append(
+            {
+                "id": agent.id,
+                "kind": agent.kind,
+                "role": Kind(int(seen.kind[a])).label,
+                "size_m": list(agent.size_m),
+                "true": _flat(xy),
+                "heading": _some(heading),
+                "detected": _flat(detected),
+                "missed": _missed(suite, index, a),
+                "error_m": _some(_later(error, late)),
+                "path": agent.path.tolist(),
+            }
+        )
+    return found
+
+
+def _missed(suite: BenchSuite, index: int, agent: int) -> list[int]:
+    """1 in frames whose picture shows an agent that the detector missed."""
+    scene, there = suite.scenes_seen[index], suite.seen[index].present[:, agent]
+    missed = (there & ~scene.detected[:, agent]).astype(float)
+    return [int(v) for v in np.nan_to_num(_later(missed, suite.delay.frames))]
+
+
+def _later(values: FloatArray, frames: int) -> FloatArray:
+    out = np.full_like(values, np.nan)
+    if frames < len(values):
+        out[frames:] = values[: len(values) - frames]
+    return out
+
+
+def _tracks(suite: BenchSuite, index: int) -> dict[str, Any]:
+    """What the tracker reports, as the rules read it, frame after frame."""
+    run = suite.run
+    frames = run.lane_slice(index)
+    first, last = np.searchsorted(run.rows.frame, [frames.start, frames.stop])
+    rows = slice(int(first), int(last))
+    start = np.searchsorted(run.rows.frame[rows], np.arange(frames.start, frames.stop + 1))
+    return {
+        "start": start.tolist(),
+        "id": run.rows.id[rows].tolist(),
+        "kind": [Kind(k).label for k in run.rows.kind[rows].tolist()],
+        "xy": _flat(suite.pose.ground_to_world(run.rows.xy_m[rows])),
+    }
+
+
+def _truth(truth: Truth) -> dict[str, Any]:
+    return {
+        "tier": (truth.danger.astype(int) + truth.imminent).tolist(),
+        "distance_m": _some(truth.distance_m),
+        "nearest_m": _some(truth.nearest_m),
+        "d_min_m": _some(truth.d_min_m),
+        "ttc_s": _some(truth.ttc_s),
+        "budget_s": _some(truth.budget_s),
+        "severity": _some(truth.severity),
+        "cyclist": truth.cyclist.tolist(),
+        "pedestrian": truth.pedestrian.tolist(),
+    }
+
+
+def _closest(truth: Truth) -> float:
+    if not np.isfinite(truth.nearest_m).any():
+        return float("nan")
+    return float(truth.time_s[int(np.argmin(truth.nearest_m))])
+
+
+def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) -> dict[str, Any]:
+    """One decision on the scenario: states, the sentence and the numbers of every frame."""
+    run, settings = suite.run, rule_settings(decision)
+    frames = run.lane_slice(index)
+    codes = suite.states(decision)
+    found = verdicts(run, settings)
+    metrics = measure(suite.truth_frames, codes)
+    own = codes[frames]
+    truth = suite.truths[index]
+    pair_frame = run.rows.frame[run.pairs.pedestrian_row]
+    start = np.searchsorted(pair_frame, np.arange(frames.start, frames.stop + 1))
+    kind = run.rows.kind
+    row_start = np.searchsorted(run.rows.frame, np.arange(frames.start, frames.stop + 1))
+    walkers = np.add.reduceat(
+        np.append(kind == int(Kind.PEDESTRIAN), False), np.minimum(row_start[:-1], len(kind))
+    )
+    walkers = np.where(row_start[1:] > row_start[:-1], walkers, 0)
+    since = run.time_s[frames] - run.cyclist_last_s[frames]
+    sentences, chosen = [], []
+    for i in range(len(own)):
+        part = slice(int(start[i]), int(start[i + 1]))
+        state = State(int(own[i]))
+        at = chosen_pair(state, found.fires[part], found.distance_m[part])
+        pair = (
+            None
+            if at is None
+            else pair_numbers(part.start + at, run.rows, run.pairs, found, settings)
+        )
+        sentences.append(explain(state, pair, int(walkers[i]), float(since[i]), settings))
+        chosen.append(-1 if at is None else part.start + at - int(start[0]))
+    alert = own == int(State.ALERT)
+    begins = np.nonzero(onsets(alert))[0]
+    return {
+        "name": name,
+        "decision": msgspec.to_builtins(decision),
+        "memory_s": settings.memory_s,
+        "lookback_s": settings.lookback_s,
+        "state": own.tolist(),
+        "sentence": sentences,
+        "chosen": chosen,
+        "pedestrians": walkers.tolist(),
+        "since_cyclist_s": _some(since),
+        "remembered": remembered(
+            run.time_s[frames], run.cyclist_last_s[frames], settings.memory_s
+        ).tolist(),
+        "pairs": _pairs(suite, found, slice(int(start[0]), int(start[-1])), start),
+        "onsets": [
+            {
+                "frame": int(i),
+                "t": float(truth.time_s[i]),
+                "budget_s": number(float(truth.budget_s[i])),
+                "danger": bool(truth.danger[i]),
+            }
+            for i in begins
+        ],
+        "metrics": metrics.scenario_dict(index),
+        "counts": _counts(truth, alert),
+    }
+
+
+def _counts(truth: Truth, alert: BoolArray) -> dict[str, int]:
+    """Frames by truth and alert, of this scenario."""
+    return {
+        "frames": len(alert),
+        "danger": int(truth.danger.sum()),
+        "actionable": int(truth.actionable.sum()),
+        "actionable_alert": int((truth.actionable & alert).sum()),
+        "calm": int((~truth.danger).sum()),
+        "calm_alert": int((~truth.danger & alert).sum()),
+    }
+
+
+def _pairs(suite: BenchSuite, found: PairVerdicts, part: slice, start: Any) -> dict[str, Any]:
+    """The numbers and the tests of every pair of every frame; `passes` holds a bit a test."""
+    run = suite.run
+    cyclist = run.pairs.cyclist_row[run.pairs.cyclist[part]]
+    pedestrian = run.pairs.pedestrian_row[part]
+    bits = np.zeros(len(cyclist), np.int64)
+    for bit, test in enumerate(TESTS):
+        bits |= getattr(found, test)[part].astype(np.int64) << bit
+    reach = np.maximum(np.hypot(*run.rows.xy_m[cyclist].T), np.hypot(*run.rows.xy_m[pedestrian].T))
+    return {
+        "start": (start - start[0]).tolist(),
+        "cyclist": run.rows.id[cyclist].tolist(),
+        "pedestrian": run.rows.id[pedestrian].tolist(),
+        "passes": bits.tolist(),
+        "distance_m": _some(found.distance_m[part]),
+        "then_m": _some(found.distance_then_m[part]),
+        "lookback_s": _some(found.lookback_s[part]),
+        "displacement_m": _some(found.displacement_m[part]),
+        "speed_mps": _some(found.speed_mps[part]),
+        "d_max_m": _some(found.d_max_m[part]),
+        "reach_m": _some(reach),
+    }
+
+
+#: Names of `PairVerdicts`, in the order of the bits of `passes`.
+TESTS = (
+    "in_range",
+    "far_enough",
+    "near_enough",
+    "judged",
+    "closing",
+    "enough",
+    "fires",
+)
+
+
+def _some(values: FloatArray) -> list[float | None]:
+    """Numbers with three decimals; null where there is none."""
+    rounded = np.round(values, 3).tolist()
+    return [v if v - v == 0 else None for v in rounded]
+
+
+def _flat(xy: FloatArray) -> list[float | None]:
+    """[x0, y0, x1, y1, ...]."""
+    return _some(np.asarray(xy).reshape(-1))

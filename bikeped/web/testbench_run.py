@@ -1,0 +1,219 @@
+"""The suite under a bench's setting, by the very code of the conformance commands.
+
+`BenchSuite` is a `Suite` whose track rows come from the bench's perception: a second camera, missed
+detections, latency, prediction. Everything that is asked of it (states, truth, metrics, gates,
+contest) is `conformance`'s own. With the configuration in force it gives what
+`bikeped conformance compare` gives, to the last digit.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from bikeped.config import LoadedConfig
+from bikeped.conformance.deployment import fuse
+from bikeped.conformance.metrics import TruthFrames
+from bikeped.conformance.montecarlo import Observed, Plan, simulate_trials, summaries
+from bikeped.conformance.perception import RecallModel, Seen, see
+from bikeped.conformance.scenario import Scenario, dump_scenario
+from bikeped.conformance.simulate import Run, Scene, Tracked, delayed, rows_of, track
+from bikeped.conformance.suite import Suite
+from bikeped.conformance.truth import Truth, TruthSettings, judge_truth
+from bikeped.errors import BikepedError
+from bikeped.geometry import CameraPose
+from bikeped.web.testbench_settings import Bench, Delay, Perception, mounted, own_scenarios
+
+T = TypeVar("T")
+
+#: Frames times lanes times slots that one answer may take: some five seconds of a small computer.
+MOST_WORK = 4_000_000
+
+
+@dataclass(frozen=True)
+class BenchSuite(Suite):
+    """A suite as one bench sees it. `second` is a further camera of the same kind and mount."""
+
+    perception: Perception = field(default_factory=Perception)
+    delay: Delay = field(default_factory=Delay)
+    second: CameraPose | None = None
+
+    @property
+    def poses(self) -> tuple[CameraPose, ...]:
+        return (self.pose,) if self.second is None else (self.pose, self.second)
+
+    @cached_property
+    def seen_second(self) -> tuple[Seen, ...]:
+        """What the second camera makes of every scenario; empty without one."""
+        if self.second is None:
+            return ()
+        return tuple(see(s, self.camera, self.second) for s in self.scenarios)
+
+    @cached_property
+    def observed(self) -> tuple[Observed, ...]:
+        """What could be detected, by all cameras together, in the first one's ground frame."""
+        model = self.perception.model() or RecallModel("size")
+        found = []
+        for i, scenario in enumerate(self.scenarios):
+            views = [self.seen[i], *self.seen_second[i : i + 1]]
+            one = fuse(scenario.name, views, self.poses, model)
+            if not self.perception.localisation_error:
+                one = replace(one, xy_m=self.seen[i].true_m)
+            found.append(one)
+        return tuple(found)
+
+    @cached_property
+    def scenes_seen(self) -> tuple[Scene, ...]:
+        """The detections of each scenario, in the trial that is shown."""
+        late, view = self.delay.frames, self.perception
+        if view.model() is None:
+            return tuple(Scene(o.xy_m, o.present, o.kind, late) for o in self.observed)
+        return tuple(o.trials([view.trial], view.seed, view.burst_frames)[0] for o in self.observed)
+
+    @cached_property
+    def tracked(self) -> Tracked:
+        found = track(self.scenes_seen)
+        # Without misses the delay is in the scenes, as `conformance latency` has it; with them the
+        # trial is tracked once and comes late, as `conformance montecarlo` and the sweep do.
+        return found if self.perception.model() is None else delayed(found, self.delay.frames)
+
+    @cached_property
+    def run(self) -> Run:
+        """Track rows as the rules read them, under this perception and delay."""
+        return rows_of(self.tracked, self.delay.order)
+
+    def with_truth(self, settings: TruthSettings) -> BenchSuite:
+        """The same suite under other thresholds; perception is not computed again."""
+        other = replace(self, truth_settings=settings)
+        for name in _KEPT:
+            if name in self.__dict__:
+                other.__dict__[name] = self.__dict__[name]
+        return other
+
+
+_KEPT = ("names", "seen", "seen_second", "observed", "scenes_seen", "tracked", "run", "hash")
+
+
+def trial_summaries(suite: BenchSuite, bench: Bench) -> dict[str, Any] | None:
+    """Means over the bench's trials with their 95 % intervals; None when nobody is missed.
+
+    In order of names, as `conformance montecarlo` counts: the same figures.
+    """
+    model = bench.perception.model()
+    if model is None:
+        return None
+    order = sorted(range(len(suite.scenarios)), key=lambda i: suite.scenarios[i].name)
+    observed = [suite.observed[i] for i in order]
+    truth = TruthFrames.join([suite.truths[i] for i in order])
+    trials = bench.perception.trials
+    check_work(suite.scenarios, trials)
+    case = (bench.delay.frames, bench.delay.order)
+    plan = Plan(model, bench.perception.burst_frames, (case,))
+    found = simulate_trials(
+        observed, truth, plan, {"": bench.decision}, range(trials), bench.perception.seed
+    )
+    return {"trials": trials, **summaries(found[case][""])}
+
+
+def check_work(scenarios: Sequence[Scenario], repeats: int = 1) -> None:
+    """BikepedError when an answer would take too long."""
+    frames = max(len(s.frame_times()) for s in scenarios)
+    slots = max(2 * max(len(s.agents) for s in scenarios), 4)
+    if frames * slots * len(scenarios) * repeats > MOST_WORK:
+        raise BikepedError(
+            "this is more than the page computes at once; take fewer trials, or fewer and shorter "
+            "scenarios, or use bikeped conformance montecarlo"
+        )
+
+
+class Workbench:
+    """Runs benches, and keeps what the last ones have in common. One at a time, in any thread."""
+
+    def __init__(self, loaded: LoadedConfig, scenarios: Sequence[Scenario]) -> None:
+        self.loaded, self.scenarios = loaded, tuple(scenarios)
+        self._texts = {id(s): dump_scenario(s) for s in self.scenarios}
+        self._seen: _Kept[Seen] = _Kept(400)
+        self._truths: _Kept[Truth] = _Kept(400)
+        self._suites: _Kept[BenchSuite] = _Kept(12)
+        self.lock = threading.RLock()
+
+    def scenarios_of(self, bench: Bench) -> tuple[Scenario, ...]:
+        """The suite with the bench's own scenarios, as `conformance contest --scenario` adds them:
+        one of a name that is there takes its place."""
+        own = {s.name: s for s in own_scenarios(bench)}
+        kept = [own.pop(s.name, s) for s in self.scenarios]
+        return (*kept, *own.values())
+
+    def whole(self, bench: Bench) -> BenchSuite:
+        """The bench's suite."""
+        return self._suite(bench, self.scenarios_of(bench))
+
+    def only(self, bench: Bench) -> BenchSuite:
+        """A suite of the one scenario that the bench shows."""
+        everyone = self.scenarios_of(bench)
+        if not bench.scenario:
+            return self._suite(bench, everyone[:1])
+        found = tuple(s for s in everyone if s.name == bench.scenario)
+        if not found:
+            raise BikepedError(f"scenario {bench.scenario!r}: is not there; choose another")
+        return self._suite(bench, found)
+
+    def _suite(self, bench: Bench, scenarios: tuple[Scenario, ...]) -> BenchSuite:
+        check_work(scenarios)
+        with self.lock:
+            camera = mounted(self.loaded, bench.camera)
+            pose = bench.camera.pose()
+            second = None if bench.second_camera is None else bench.second_camera.pose()
+            texts = [self._text(s) for s in scenarios]
+            where = msgspec.json.encode(bench.camera)
+            # How many trials are averaged changes nothing of the one that is shown.
+            perception = msgspec.structs.replace(bench.perception, trials=1)
+            key = (*texts, where, msgspec.json.encode([perception, bench.delay]), str(second))
+
+            def make() -> BenchSuite:
+                suite = BenchSuite(
+                    scenarios, camera, pose, TruthSettings(), perception, bench.delay, second
+                )
+                suite.__dict__["seen"] = tuple(
+                    self._seen.get((text, where), lambda s=scenario: see(s, camera, pose))
+                    for text, scenario in zip(texts, scenarios, strict=True)
+                )
+                return suite
+
+            suite = self._suites.get(key, make)
+            suite.run  # noqa: B018 - computed now, and shared by what follows
+            settings = bench.danger.settings()
+            told = suite.with_truth(settings)
+            told.__dict__["truths"] = tuple(
+                self._truths.get((text, settings), lambda s=scenario: judge_truth(s, settings))
+                for text, scenario in zip(texts, scenarios, strict=True)
+            )
+            return told
+
+    def _text(self, scenario: Scenario) -> str:
+        """A key of the scenario's contents."""
+        known = self._texts.get(id(scenario))  # those are kept, so no other has their id
+        return dump_scenario(scenario) if known is None else known
+
+
+class _Kept(Generic[T]):
+    """The last `most` values, made when they are asked for the first time."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._items: OrderedDict[Any, T] = OrderedDict()
+
+    def get(self, key: Any, make: Callable[[], T]) -> T:
+        if key in self._items:
+            self._items.move_to_end(key)
+            return self._items[key]
+        self._items[key] = value = make()
+        if len(self._items) > self._most:
+            self._items.popitem(last=False)
+        return value

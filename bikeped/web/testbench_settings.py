@@ -1,0 +1,325 @@
+"""Everything that the test bench lets people change, with its ranges: one `Bench`.
+
+A bench is what a run is made of: the scenario shown, further scenarios, the decision's numbers, how
+the camera hangs and what it misses, the delay, and what counts as danger. It travels as JSON (the
+page's requests), as a link (`link_of`, `parse_link`: only what differs from the configuration in
+force, readable) and as a file (`bikeped testbench contest FILE`); all three say the same.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+from urllib.parse import parse_qsl, quote, urlsplit
+
+import msgspec
+from msgspec import Meta
+
+from bikeped.config import CameraConfig, DecisionConfig, LoadedConfig, ground_camera
+from bikeped.config.section import Section
+from bikeped.conformance.latency import delay_frames
+from bikeped.conformance.perception import SIMULATION_POSE, RecallModel
+from bikeped.conformance.scenario import Scenario, parse_scenario
+from bikeped.conformance.truth import TruthSettings
+from bikeped.errors import BikepedError, ScenarioError
+from bikeped.geometry import CameraPose, GroundCamera
+
+#: A script of somebody's own: what the page draws in a moment, not what a batch computes.
+MAX_SCRIPTS = 30
+MAX_SCRIPT_CHARS = 60_000
+MAX_AGENTS = 40
+MAX_DURATION_S = 120.0
+MAX_COORDINATE_M = 200.0
+_MAX_LINK_CHARS = 900_000
+
+
+class Pose(Section, frozen=True):
+    """Where a camera stands in the plan and where it looks."""
+
+    x_m: Annotated[float, Meta(ge=-100, le=100, description="east, m")]
+    y_m: Annotated[float, Meta(ge=-100, le=100, description="north, m")]
+    heading_deg: Annotated[
+        float, Meta(ge=-360, le=360, description="from east, counter-clockwise, degrees")
+    ]
+
+    def pose(self) -> CameraPose:
+        return CameraPose(self.x_m, self.y_m, self.heading_deg)
+
+
+class Mount(Pose, frozen=True):
+    """How the camera hangs; the lens, its circle and its centre are the configuration's."""
+
+    height_m: Annotated[float, Meta(ge=1, le=15, description="above the ground, m")]
+    pitch_deg: Annotated[float, Meta(ge=-90, le=30, description="0 level, -90 straight down")]
+    fov_deg: Annotated[float, Meta(ge=30, le=240, description="field of view, degrees")]
+
+
+class Perception(Section, frozen=True):
+    """What the camera misses and misplaces."""
+
+    localisation_error: Annotated[
+        bool, Meta(description="place people where the camera would, not where they are")
+    ] = True
+    recall: Annotated[
+        Literal["all", "size", "kind", "fixed"],
+        Meta(
+            description="all: nobody is missed; size: recall measured by size in the picture; "
+            "kind: the measured overall recall of each kind; fixed: the number below"
+        ),
+    ] = "all"
+    recall_value: Annotated[
+        float, Meta(ge=0.05, le=1, description="share of detections that are made, with fixed")
+    ] = 0.75
+    burst_frames: Annotated[
+        float | None,
+        Meta(description="mean length of a run of misses, frames; null: independent misses"),
+    ] = None
+    seed: Annotated[int, Meta(ge=0, le=2**31, description="seed of the misses")] = 0
+    trial: Annotated[int, Meta(ge=0, le=999, description="which random trial is shown")] = 0
+    trials: Annotated[
+        int, Meta(ge=1, le=50, description="trials over which the suite's means are taken")
+    ] = 10
+
+    def model(self) -> RecallModel | None:
+        """The recall model; None when nobody is missed."""
+        if self.recall == "all":
+            return None
+        if self.recall == "fixed":
+            return RecallModel("curve", ((0.0,), (self.recall_value,)))
+        return RecallModel("size" if self.recall == "size" else "flat")
+
+
+class Delay(Section, frozen=True):
+    """Camera latency, and how far tracks are carried over it."""
+
+    delay_ms: Annotated[float, Meta(ge=0, le=1000, description="age of every picture, ms")] = 0.0
+    order: Annotated[
+        Literal[0, 1, 2],
+        Meta(description="prediction over the delay: 0 none, 1 velocity, 2 acceleration too"),
+    ] = 0
+
+    @property
+    def frames(self) -> int:
+        return delay_frames(self.delay_ms)
+
+
+class Danger(Section, frozen=True):
+    """The free thresholds of the ground truth (definitions, section 5)."""
+
+    cpa_radius_m: Annotated[
+        float, Meta(gt=0, le=25, description="a pair that will come nearer than this, m")
+    ] = 5.0
+    stopping_margin: Annotated[
+        float, Meta(gt=0, le=10, description="share of the gap that stopping must leave")
+    ] = 0.8
+    ttc_bound_s: Annotated[
+        Annotated[float, Meta(gt=0, le=60)] | None,
+        Meta(description="time to contact below which danger holds, s; null: 1.87 s + clearance"),
+    ] = None
+    braking: Annotated[
+        Literal["bicycle", "ebike", "aashto"] | None,
+        Meta(description="braking of all cyclists; null: by the scenario's vehicle"),
+    ] = None
+
+    def settings(self) -> TruthSettings:
+        return TruthSettings(
+            self.cpa_radius_m, self.stopping_margin, self.ttc_bound_s, self.braking
+        )
+
+
+class Bench(Section, frozen=True):
+    """One setting of the whole bench."""
+
+    camera: Mount
+    decision: DecisionConfig = msgspec.field(default_factory=DecisionConfig)
+    perception: Perception = msgspec.field(default_factory=Perception)
+    delay: Delay = msgspec.field(default_factory=Delay)
+    danger: Danger = msgspec.field(default_factory=Danger)
+    second_camera: Pose | None = None
+    scenario: Annotated[str, Meta(max_length=200)] = ""  #: the one shown; empty: the first
+    #: Named configurations that are shown beside the bench's decision.
+    beside: Annotated[tuple[Annotated[str, Meta(max_length=60)], ...], Meta(max_length=2)] = ()
+    #: Scenarios of one's own (texts of scenario files); one of a name that is there replaces it.
+    scripts: Annotated[
+        tuple[Annotated[str, Meta(max_length=MAX_SCRIPT_CHARS)], ...], Meta(max_length=MAX_SCRIPTS)
+    ] = ()
+
+
+def in_force(loaded: LoadedConfig) -> Bench:
+    """The bench that changes nothing: the configuration's decision and camera, where the paper's
+    simulation camera stands."""
+    camera = ground_camera(loaded)
+    fov_deg = loaded.config.camera.fov_deg
+    if fov_deg is None and loaded.calibration is not None:
+        fov_deg = loaded.calibration.fov_deg
+    pose = SIMULATION_POSE
+    return Bench(
+        camera=Mount(
+            x_m=pose.x_m,
+            y_m=pose.y_m,
+            heading_deg=pose.heading_deg,
+            height_m=camera.height_m,
+            pitch_deg=camera.pitch_deg,
+            fov_deg=fov_deg or 180.0,
+        ),
+        decision=loaded.config.decision,
+    )
+
+
+def mounted(loaded: LoadedConfig, mount: Mount) -> GroundCamera:
+    """The configuration's camera, hung as `mount` says: as `--set camera.height_m=...` makes it."""
+    return ground_camera(with_mount(loaded, mount))
+
+
+def with_mount(loaded: LoadedConfig, mount: Mount) -> LoadedConfig:
+    """The configuration with this height, pitch and field of view."""
+    changed = {
+        key: value
+        for key, value in (
+            ("height_m", mount.height_m),
+            ("pitch_deg", mount.pitch_deg),
+            ("fov_deg", mount.fov_deg),
+        )
+        if value != getattr(in_force(loaded).camera, key)
+    }
+    if not changed:
+        return loaded
+    camera: CameraConfig = msgspec.structs.replace(loaded.config.camera, **changed)
+    config = msgspec.structs.replace(loaded.config, camera=camera)
+    return replace(loaded, config=config)
+
+
+def check_bench(bench: Bench) -> Bench:
+    """What single ranges cannot say; BikepedError names the key and the mend."""
+    decision = bench.decision
+    if decision.d_min_m > decision.d_max_m:
+        raise BikepedError(
+            f"decision.d_min_m: {decision.d_min_m:g} is above decision.d_max_m "
+            f"{decision.d_max_m:g}; exchange them"
+        )
+    burst = bench.perception.burst_frames
+    if burst is not None and not 1 <= burst <= 1000:
+        raise BikepedError(f"perception.burst_frames: {burst:g} is not 1 to 1000 frames")
+    return bench
+
+
+def own_scenarios(bench: Bench) -> list[Scenario]:
+    """The scenarios that came with the bench, checked as files are, and small enough for a page."""
+    found: list[Scenario] = []
+    for number, text in enumerate(bench.scripts, 1):
+        found.append(parse_own(text, f"scenario {number}"))
+    names = [s.name for s in found]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise ScenarioError(f"scenario {twice!r}: is there twice; give each its own name")
+    return found
+
+
+def parse_own(text: str, source: str) -> Scenario:
+    """A scenario from a page; ScenarioError when it is wrong, or too large to answer at once."""
+    scenario = parse_scenario(text, source)
+    if len(scenario.agents) > MAX_AGENTS:
+        raise ScenarioError(
+            f"{source}: agents: {len(scenario.agents)} are too many for the page, which takes "
+            f"{MAX_AGENTS}; use bikeped conformance run --scenarios"
+        )
+    if scenario.duration_s > MAX_DURATION_S:
+        raise ScenarioError(
+            f"{source}: lasts {scenario.duration_s:g} s and the page takes {MAX_DURATION_S:g} s; "
+            "use bikeped conformance run --scenarios"
+        )
+    if any(abs(agent.path[:, 1:]).max() > MAX_COORDINATE_M for agent in scenario.agents):
+        raise ScenarioError(f"{source}: a position is over {MAX_COORDINATE_M:g} m away; use metres")
+    return scenario
+
+
+# --- as a link
+
+
+def link_of(bench: Bench, base: Bench) -> str:
+    """What differs from `base` as `key=value&...`, readable: `decision.d_max_m=15`."""
+    return "&".join(
+        f"{key}={quote(_text(value), safe='')}" for key, value in _differences(bench, base)
+    )
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+
+
+#: What says only how it is looked at, and changes no figure of the suite.
+VIEW = ("scenario", "beside")
+
+
+def _differences(bench: Bench, base: Bench) -> list[tuple[str, Any]]:
+    now, before = msgspec.to_builtins(bench), msgspec.to_builtins(base)
+    found: list[tuple[str, Any]] = []
+    for key, value in now.items():
+        if isinstance(value, dict) and isinstance(before[key], dict):
+            found += [(f"{key}.{k}", v) for k, v in value.items() if v != before[key][k]]
+        elif value != before[key]:
+            found.append((key, value))
+    return found
+
+
+def parse_link(link: str, base: Bench) -> Bench:
+    """The bench of a link: a whole address or only what follows its `#`.
+
+    BikepedError names the key and the mend.
+    """
+    if len(link) > _MAX_LINK_CHARS:
+        raise BikepedError("link: too long; use the file instead")
+    text = urlsplit(link.strip()).fragment if "#" in link else link.strip()
+    data = msgspec.to_builtins(base)
+    try:
+        items = parse_qsl(text, keep_blank_values=True, strict_parsing=bool(text), errors="strict")
+    except ValueError as error:
+        raise BikepedError("link: expected key=value&key=value; copy all of it") from error
+    for key, value in items:
+        section, dot, name = key.partition(".")
+        place = data.get(section) if dot else data
+        if not isinstance(place, dict) or (name if dot else key) not in place:
+            raise BikepedError(f"link: {key[:60]}: there is no such setting; copy the link anew")
+        place[name if dot else key] = _value(value, key)
+    return _bench(data, "link")
+
+
+def _value(text: str, key: str) -> Any:
+    if key == "scenario":
+        return text
+    try:
+        return json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError):
+        return text  # a word: decision.rule=ttc
+
+
+def _no_number(name: str) -> Any:
+    raise ValueError(f"{name} is not a number")
+
+
+# --- as a file
+
+
+def file_of(bench: Bench, base: Bench, facts: dict[str, Any]) -> str:
+    """A challenge as a file: all settings, and what they were measured against."""
+    data = {"format": 1, **facts, "link": link_of(bench, base), "bench": msgspec.to_builtins(bench)}
+    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+
+
+def parse_file(text: str | bytes, source: str) -> Bench:
+    """The bench of a challenge's file; BikepedError names the file, the key and the mend."""
+    try:
+        data = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise BikepedError(f"{source}: is not JSON ({error}); save the challenge anew") from error
+    if not isinstance(data, dict) or data.get("format") != 1 or "bench" not in data:
+        raise BikepedError(f"{source}: is no challenge of the test bench; save it there")
+    return _bench(data["bench"], source)
+
+
+def _bench(data: Any, source: str) -> Bench:
+    try:
+        return check_bench(msgspec.convert(data, Bench, strict=True))
+    except msgspec.ValidationError as error:
+        raise BikepedError(f"{source}: {error}; correct it there") from error
