@@ -34,6 +34,7 @@ MEDIAN_OF_NOISE = 1.17741
 SOFT_L1_TURN = 3.0
 _FLOOR_PX = 1e-4
 _MOST_STEPS, _MOST_DAMPINGS = 60, 12
+_FIRST_DAMPING, _NEAR_DAMPING = 1e-4, 1e-8
 _SAME_COST = 1e-9
 
 
@@ -142,7 +143,8 @@ def minimise(
     state = start
     error = residuals(state, sightings)
     before = cost = cost_of(error, state)
-    damping, steps, stopped, slope = 1e-4, 0, "the most steps were taken", np.inf
+    damping = _FIRST_DAMPING if turn_px is None else _NEAR_DAMPING
+    steps, stopped, slope = 0, "the most steps were taken", np.inf
     while steps < _MOST_STEPS:
         jac, pulled = whitened(jacobian(state, flat), error, turn_px)
         normal = normal_equations(jac, pulled, sightings.seen.astype(np.float64), basis)

@@ -26,7 +26,6 @@ from bikeped.geometry.lens import Projection, curve
 EQUAL_SHARE = 0.02
 #: A focal length known no better than this is not known.
 _WORST_FOCAL_SHARE = 0.02
-TERMS = (0, 2, 4)
 
 
 @dataclass(frozen=True)
@@ -61,9 +60,13 @@ class Recommendation:
 
 
 def models_to_compare(chosen: Model) -> list[Model]:
-    """All projections with 0, 2 and 4 radial terms, and the chosen one's with the board's shape."""
-    models = [Model(p, terms) for terms in TERMS for p in FISHEYE]
-    models += [Model(chosen.projection, terms, True) for terms in TERMS[1:]]
+    """All projections without and with two radial terms; four, and the board's shape, on one.
+
+    With four terms all projections are the same lens to a thousandth of a pixel (measured), so that
+    one stands for all.
+    """
+    models = [Model(p, terms) for terms in (0, 2) for p in FISHEYE]
+    models += [Model(chosen.projection, 4), *(Model(chosen.projection, t, True) for t in (2, 4))]
     return models if chosen in models else [*models, chosen]
 
 

@@ -37,7 +37,7 @@ class Fit:
     held_out_px: (
         FloatArray | None
     )  #: residuals of each picture when it did not help; None: not asked
-    uncertainty: dict[str, float]  #: one standard deviation of each parameter of the lens
+    covariance: FloatArray  #: of the lens's parameters, in the model's order
 
     @property
     def name(self) -> str:
@@ -69,6 +69,22 @@ class Fit:
     @property
     def focal_px(self) -> float:
         return float(self.state.lens[2])
+
+    @property
+    def uncertainty(self) -> dict[str, float]:
+        """One standard deviation of each parameter of the lens. It knows the corners' noise only,
+        not a wrong model: see the cross-validated error."""
+        sigma = np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
+        return {n: float(s) for n, s in zip(self.model.parameters, sigma, strict=True)}
+
+    def radius_sigma_px(self, theta: FloatArray) -> FloatArray:
+        """One standard deviation of r(theta), from the covariance of f and the radial terms."""
+        base = curve(self.state.projection, theta)
+        slopes = [base * gain(theta, self.state.lens[PLAIN:])]
+        slopes += [self.focal_px * base * theta ** (2 * n + 2) for n in range(self.model.terms)]
+        rows = np.stack(slopes, axis=-1)
+        inner = self.covariance[2:, 2:]
+        return np.asarray(np.sqrt(np.maximum(((rows @ inner) * rows).sum(-1), 0.0)))
 
     @property
     def angles_rad(self) -> FloatArray:
@@ -104,13 +120,13 @@ def fit(sightings: Sightings, model: Model, start: State, folds: int = 0) -> Fit
         sightings,
         adjusted.residuals_px,
         held_out,
-        uncertainty(adjusted, sightings),
+        covariance_of(adjusted, sightings),
     )
 
 
-def uncertainty(adjusted: Adjusted, sightings: Sightings) -> dict[str, float]:
-    """Standard deviation of each lens parameter: the reduced normal matrix and the noise that the
-    residuals show. It knows noise only, not a wrong model: see the cross-validated error."""
+def covariance_of(adjusted: Adjusted, sightings: Sightings) -> FloatArray:
+    """Covariance of the lens's parameters: the normal matrix without poses and shape, inverted,
+    times the variance that the residuals show."""
     state, flat = adjusted.state, sightings.flat
     basis = gauge_basis(flat) if adjusted.model.board else None
     normal = normal_equations(
@@ -127,9 +143,8 @@ def uncertainty(adjusted: Adjusted, sightings: Sightings) -> dict[str, float]:
         normal.shared[m:, m:] += basis.T @ (spread[:, None] * basis)
         free -= basis.shape[1]
     variance = square / max(int(free), 1)
-    covariance = normal.reduced_inverse() * variance
-    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    return {name: float(sigma[i]) for i, name in enumerate(adjusted.model.parameters)}
+    size = len(state.lens)
+    return np.asarray(normal.reduced_inverse()[:size, :size] * variance)
 
 
 def rms_per_point(error: FloatArray, sightings: Sightings) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.calibration.model import PLAIN, State, board_points, cross_matrices, gain
+from bikeped.calibration.model import PLAIN, State, board_points, gain
 from bikeped.geometry.lens import curve, curve_slope
 from bikeped.types import FloatArray
 
@@ -77,7 +77,12 @@ def jacobian(state: State, flat: FloatArray) -> Jacobian:
     to_point[..., 1, 2] = inward * uy
 
     pose = np.empty((*theta.shape, 2, 6))
-    pose[..., :3] = to_point @ -cross_matrices(turned)
+    # a . (w x q) = w . (q x a), for the turned corner q and each row a.
+    qx, qy, qz = (turned[..., None, axis] for axis in range(3))
+    ax, ay, az = (to_point[..., axis] for axis in range(3))
+    pose[..., 0] = qy * az - qz * ay
+    pose[..., 1] = qz * ax - qx * az
+    pose[..., 2] = qx * ay - qy * ax
     pose[..., 3:] = to_point
     shape = to_point @ state.turn[:, None]
     radius = focal * unit

@@ -171,7 +171,7 @@ def bearings(
 
 def rotations(vector: FloatArray) -> FloatArray:
     """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] (Rodrigues)."""
-    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    angle = np.sqrt((vector * vector).sum(-1))[..., None, None]
     k = cross_matrices(vector)
     small = angle < 1e-6
     safe = np.where(small, 1.0, angle)
@@ -207,11 +207,8 @@ def rotation_vectors(turn: FloatArray) -> FloatArray:
 
 def cross_matrices(vector: FloatArray) -> FloatArray:
     """[..., 3, 3] matrices of the cross product with vectors [..., 3]."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    zero = np.zeros_like(x)
-    rows = [
-        np.stack([zero, -z, y], axis=-1),
-        np.stack([z, zero, -x], axis=-1),
-        np.stack([-y, x, zero], axis=-1),
-    ]
-    return np.stack(rows, axis=-2)
+    out = np.zeros((*vector.shape, 3))
+    out[..., 2, 1] = vector[..., 0]
+    out[..., 0, 2] = vector[..., 1]
+    out[..., 1, 0] = vector[..., 2]
+    return np.asarray(out - np.swapaxes(out, -1, -2))

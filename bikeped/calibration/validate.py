@@ -41,7 +41,7 @@ def fit_poses(start: State, sightings: Sightings, steps: int = 20) -> State:
     state = start
     error = residuals(state, sightings)
     cost: FloatArray = np.asarray((error * error).sum((1, 2)))
-    damping: FloatArray = np.full(len(cost), 1e-4)
+    damping: FloatArray = np.full(len(cost), 1e-8)
     index = np.arange(6)
     for _ in range(steps):
         jac = jacobian(state, sightings.flat).pose * sightings.seen[..., None, None]
