@@ -9,6 +9,8 @@ import click
 #: Command: module that holds it as `command`, imported only when asked for.
 COMMANDS = {
     "augment": "bikeped.cli.model_augment",
+    "train": "bikeped.cli.model_train",
+    "export": "bikeped.cli.model_export",
     "evaluate": "bikeped.cli.model_evaluate",
 }
 

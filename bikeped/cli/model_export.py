@@ -1,0 +1,101 @@
+"""`bikeped model export`: weights to ONNX, ONNX to a TensorRT engine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bikeped.cli.common import console, json_option, write_json
+from bikeped.cli.guard import guarded
+from bikeped.errors import DetectorError
+
+
+@click.command("export")
+@click.argument("weights", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="The ONNX file. Default: WEIGHTS with .onnx; nothing where WEIGHTS is ONNX already.",
+)
+@click.option(
+    "--engine",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Build a TensorRT engine, too; on the Jetson that will run it.",
+)
+@click.option(
+    "--size",
+    type=click.IntRange(64, 4096),
+    default=1280,
+    show_default=True,
+    help="Side of the square input of a YOLO; the small network knows its own.",
+)
+@click.option("--full-precision", is_flag=True, help="An engine without 16-bit floats.")
+@click.option(
+    "--workspace-mb",
+    type=click.IntRange(16, 1 << 20),
+    default=2048,
+    show_default=True,
+    help="Memory that TensorRT may try plans with.",
+)
+@json_option
+@guarded
+def command(
+    weights: Path,
+    out: Path | None,
+    engine: Path | None,
+    size: int,
+    full_precision: bool,
+    workspace_mb: int,
+    json_path: str | None,
+) -> int:
+    """Export WEIGHTS (weights.pt of `model train`, or an .onnx file) to ONNX and TensorRT."""
+    summary: dict[str, Any] = {}
+    if weights.suffix.lower() == ".onnx":
+        if out is not None or engine is None:
+            raise DetectorError(
+                f"{weights}: is ONNX already; name --engine FILE.engine to build from it, without "
+                "--out"
+            )
+        model = weights
+    else:
+        from bikeped.training.needs import need
+
+        need("torch", "model export")
+        from bikeped.training.export import export_any
+
+        model = weights.with_suffix(".onnx") if out is None else out
+        _expect(model, ".onnx")
+        summary = export_any(weights, model, size)
+    if engine is not None:
+        from bikeped.training.engine import build_engine
+
+        _expect(engine, ".engine")
+        built = build_engine(model, engine, half=not full_precision, workspace_mb=workspace_mb)
+        summary |= built.as_dict()
+    if json_path is not None:
+        write_json(summary, json_path)
+    if json_path != "-":
+        _print(summary)
+    return 0
+
+
+def _expect(path: Path, suffix: str) -> None:
+    if path.suffix.lower() != suffix:
+        raise DetectorError(f"{path}: bikeped knows a model by its name; end it with {suffix}")
+
+
+def _print(summary: dict[str, Any]) -> None:
+    screen = console()
+    if "model" in summary:
+        screen.print(
+            f"wrote {summary['model']}: {summary['bytes'] / 1e6:.2f} MB, input "
+            f"{summary['size'][0]} x {summary['size'][1]}, {', '.join(summary['names'])}; boxes "
+            f"within {summary['largest_box_difference_px']:.2g} px of PyTorch's"
+        )
+    if "engine" in summary:
+        screen.print(
+            f"wrote {summary['engine']}: {summary['engine_bytes'] / 1e6:.2f} MB, TensorRT "
+            f"{summary['tensorrt']}, {'16' if summary['half_precision'] else '32'}-bit"
+        )

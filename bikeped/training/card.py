@@ -1,0 +1,220 @@
+"""What a model is worth on drawn streets that it never saw: the numbers of its card.
+
+Pictures are drawn from seeds, places and lights outside the training's, encoded and decoded as the
+camera's are, and shown to the model through the very `load_detector` of the service.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from bikeped.capture.jpeg import JpegDecoder
+from bikeped.config import LoadedConfig
+from bikeped.config.sections import DetectionConfig
+from bikeped.detection import Detector, load_detector
+from bikeped.scene import DrawnObject, SceneCamera, pictures, scene_camera
+from bikeped.scene.clip import encode_jpeg
+from bikeped.types import Detections, FloatArray, Kind
+
+#: Bounds of the distance rings, metres along the ground from below the lens.
+RINGS_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0)
+NEAR_M = 15.0  #: the requirement's range
+LEAST_VISIBLE = 0.3  #: of somebody, or nobody is asked to see it
+LEAST_SIDE_PX = 5.0  #: of its box at 960 pixels across
+MATCH_IOU = 0.5
+_QUALITY = 88
+_FAR = 35.0
+
+
+@dataclass(frozen=True)
+class DrawnTest:
+    """`pictures` at 1920 x 1080 from `seed` on; `own_lens`: through fisheyes of every kind instead
+    of the configured camera."""
+
+    pictures: int = 400
+    seed: int = 9_000_001
+    part: int = 20
+    own_lens: bool = False
+    size: tuple[int, int] = (1920, 1080)
+    processes: int = 2
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One object of one picture, or one detection that is nobody (`distance_m` NaN)."""
+
+    kind: Kind
+    distance_m: float
+    found: bool
+    confidence: float  #: 0 where not found
+    error_m: float  #: of the box's bottom centre on the ground; NaN where not found or no ground
+
+
+def drawn_test(
+    model: DetectionConfig,
+    loaded: LoadedConfig,
+    test: DrawnTest,
+    progress: Callable[[int], None] = lambda done: None,
+) -> list[list[Sight]]:
+    """What the model made of every picture. `model.model` is an absolute path."""
+    detector = load_detector(model, Path("/"))
+    seen = []
+    for jpeg, objects, view in _drawn(loaded, test):
+        found = _look(detector, jpeg, view)
+        seen.append(_sights(found, objects, view))
+        progress(len(seen))
+    return seen
+
+
+def summary(seen: Sequence[Sequence[Sight]], confidence: float) -> dict[str, Any]:
+    """The numbers at one confidence: recall and error by kind and ring, false ones a 100 frames."""
+    rows = [s for picture in seen for s in picture]
+    result: dict[str, Any] = {"frames": len(seen), "confidence": confidence, "kinds": {}}
+    for kind in Kind:
+        mine = [s for s in rows if s.kind == kind and not np.isnan(s.distance_m)]
+        rings = [
+            {"from_m": low, "to_m": high, **_numbers(mine, low, high, confidence)}
+            for low, high in pairwise(RINGS_M)
+        ]
+        false = sum(
+            s.kind == kind and np.isnan(s.distance_m) and s.confidence >= confidence for s in rows
+        )
+        result["kinds"][kind.label] = {
+            "within_15_m": _numbers(mine, 0, NEAR_M, confidence),
+            "rings": rings,
+            "false_per_100_frames": round(100 * false / max(1, len(seen)), 3),
+        }
+    result["false_pedestrian_or_cyclist_per_100_frames"] = round(
+        sum(
+            result["kinds"][k.label]["false_per_100_frames"]
+            for k in (Kind.PEDESTRIAN, Kind.CYCLIST)
+        ),
+        3,
+    )
+    return result
+
+
+def sweep(seen: Sequence[Sequence[Sight]], confidences: Sequence[float]) -> list[dict[str, float]]:
+    """Recall within 15 m and false ones a 100 frames over confidences: how to choose one."""
+    rows = []
+    for confidence in confidences:
+        numbers = summary(seen, confidence)
+        rows.append(
+            {
+                "confidence": confidence,
+                "false_per_100_frames": numbers["false_pedestrian_or_cyclist_per_100_frames"],
+                **{
+                    kind.label: numbers["kinds"][kind.label]["within_15_m"]["recall"]
+                    for kind in (Kind.PEDESTRIAN, Kind.CYCLIST)
+                },
+            }
+        )
+    return rows
+
+
+def _numbers(mine: list[Sight], low: float, high: float, confidence: float) -> dict[str, Any]:
+    inside = [s for s in mine if low <= s.distance_m < high]
+    hits = [s for s in inside if s.found and s.confidence >= confidence]
+    errors = np.array([s.error_m for s in hits if np.isfinite(s.error_m)])
+    return {
+        "objects": len(inside),
+        "recall": round(len(hits) / len(inside), 4) if inside else None,
+        "median_error_m": round(float(np.median(errors)), 3) if len(errors) else None,
+        "p90_error_m": round(float(np.quantile(errors, 0.9)), 3) if len(errors) else None,
+    }
+
+
+def _drawn(
+    loaded: LoadedConfig, test: DrawnTest
+) -> Iterator[tuple[bytes, list[DrawnObject], SceneCamera]]:
+    parts = -(-test.pictures // test.part)
+    sizes = [min(test.part, test.pictures - i * test.part) for i in range(parts)]
+    with ProcessPoolExecutor(test.processes, mp_context=get_context("spawn")) as pool:
+        jobs = [
+            pool.submit(_part, loaded, test, number, count) for number, count in enumerate(sizes)
+        ]
+        for job in jobs:
+            yield from job.result()
+
+
+def _part(
+    loaded: LoadedConfig, test: DrawnTest, number: int, count: int
+) -> list[tuple[bytes, list[DrawnObject], SceneCamera]]:
+    cv2.setNumThreads(1)
+    camera = None if test.own_lens else scene_camera(loaded, test.size)
+    drawn = pictures(count, test.seed + number, camera, size=test.size)
+    return [(encode_jpeg(image, _QUALITY), objects, view) for image, objects, _, view in drawn]
+
+
+def _look(detector: Detector, jpeg: bytes, view: SceneCamera) -> Detections:
+    width, height = view.size
+    rgb = JpegDecoder(1).decode(jpeg, *detector.decode_size(width, height))
+    return detector.infer(rgb, width, height).detections
+
+
+def _sights(found: Detections, objects: Sequence[DrawnObject], view: SceneCamera) -> list[Sight]:
+    """Greedy by confidence, kind for kind, at an overlap of at least `MATCH_IOU`.
+
+    A detection on somebody who is hardly visible, tiny or very far, of whatever kind, is neither
+    right nor wrong.
+    """
+    least = LEAST_SIDE_PX * view.size[0] / 960
+    box = np.array([o.box_px for o in objects], np.float64).reshape(-1, 4)
+    side = (box[:, 2:] - box[:, :2]).min(axis=1, initial=np.inf) if len(box) else np.zeros(0)
+    asked = np.array(
+        [
+            o.visible >= LEAST_VISIBLE and s >= least and o.distance_m < _FAR
+            for o, s in zip(objects, side, strict=True)
+        ],
+        bool,
+    )
+    kind = np.array([int(o.label) for o in objects], np.int64)
+    overlap = _overlap(found.box_px.astype(np.float64), box)
+    taken: dict[int, int] = {}
+    rows = []
+    for d in range(len(found)):
+        fits = [
+            (overlap[d, o], o)
+            for o in np.nonzero((overlap[d] >= MATCH_IOU) & (kind == found.kind[d]) & asked)[0]
+            if o not in taken
+        ]
+        if fits:
+            taken[int(max(fits)[1])] = d
+        elif not (overlap[d] * ~asked >= MATCH_IOU / 2).any():
+            label = Kind(int(found.kind[d]))
+            rows.append(Sight(label, np.nan, False, float(found.confidence[d]), np.nan))
+    ground, valid = _ground(found, view)
+    for o in np.nonzero(asked)[0].tolist():
+        item, d = objects[o], taken.get(o, -1)
+        error = np.nan
+        if d >= 0 and valid[d]:
+            error = float(np.hypot(*(ground[d] - item.xy_m)))
+        confidence = float(found.confidence[d]) if d >= 0 else 0.0
+        rows.append(Sight(item.label, item.distance_m, d >= 0, confidence, error))
+    return rows
+
+
+def _ground(found: Detections, view: SceneCamera) -> tuple[FloatArray, Any]:
+    """Bottom centres on the ground [n, 2], and which of them lie there."""
+    xy, valid = view.camera.ground(view.framing.frame_to_crop(found.bottom_centre_px()))
+    return xy, valid
+
+
+def _overlap(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Intersection over union [n, m]."""
+    low = np.maximum(a[:, None, :2], b[None, :, :2])
+    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    shared = np.maximum(high - low, 0).prod(axis=2)
+    area_a, area_b = ((x[:, 2:] - x[:, :2]).prod(axis=1) for x in (a, b))
+    union = area_a[:, None] + area_b[None] - shared
+    result: FloatArray = shared / np.maximum(union, 1e-9)
+    return result

@@ -1,0 +1,218 @@
+"""Pieces of pictures to learn from: cut, turned to another scale, another light, partly covered.
+
+A picture is first brought to the size at which the network will see it, by the very letterbox of
+`bikeped.detection`. Then windows of the training size are cut from it: most of them around an
+object, the others anywhere. Everything follows from the seed and the step's number, whatever thread
+does the work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bikeped.capture.jpeg import JpegDecoder
+from bikeped.detection.preprocess import PAD, Letterbox
+from bikeped.errors import CaptureError, DataSetError
+from bikeped.training.coco import CocoData, CocoImage, read_picture
+from bikeped.types import FloatArray, ImageArray, IntArray
+
+_LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
+_LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
+_NOISES, _NOISIEST = 16, 10.0  #: patterns, standard deviation of the strongest in grey levels
+
+
+@dataclass(frozen=True)
+class CropSettings:
+    """How windows are cut and changed; every range is drawn from evenly."""
+
+    view: tuple[int, int] = (960, 544)  #: width and height of the network's input, pixels
+    window: tuple[int, int] = (480, 288)
+    around_object: float = 0.55  #: share of windows that are cut around an object
+    around_usual: float = 0.25  #: share cut where some other picture has an object
+    scale: tuple[float, float] = (0.8, 1.3)
+    flip: float = 0.5
+    cover: float = 0.15  #: share of windows with something in front of an object
+    light: float = 0.9  #: share of windows whose light and colours are changed
+
+
+@dataclass(frozen=True)
+class Crop:
+    """One window: `rgb` [h, w, 3], objects in its pixels, and boxes that are not to be judged."""
+
+    rgb: ImageArray
+    box_px: FloatArray
+    class_id: IntArray
+    ignored_px: FloatArray
+
+
+@dataclass(frozen=True)
+class View:
+    """A whole picture at the network's size, letterboxed: `rgb` [h, w, 3] and what is in it."""
+
+    rgb: ImageArray
+    box_px: FloatArray
+    class_id: IntArray
+    crowd: IntArray  #: 1 where a box stands for many
+
+
+def class_ids(data: CocoData) -> dict[int, int]:
+    """Category id of the data set -> class of the network, in the order of the ids."""
+    return {category: number for number, category in enumerate(data.categories)}
+
+
+def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
+    """A picture as a network of input `size` (width, height) sees it; DataSetError as `coco`'s."""
+    fit = Letterbox.fit(image.width, image.height, size, "ultralytics")
+    rgb = np.full((size[1], size[0], 3), PAD, np.uint8)
+    rgb[fit.top : fit.top + fit.height, fit.left : fit.left + fit.width] = cv2.resize(
+        _reduced(image, fit.width, fit.height), (fit.width, fit.height)
+    )
+    found = data.objects[image.id]
+    box = np.array([o.box_px for o in found], np.float64).reshape(-1, 4)
+    known = class_ids(data)
+    return View(
+        rgb,
+        fit.forward(box).astype(np.float64),
+        np.array([known[o.category_id] for o in found], np.int64),
+        np.array([o.crowd for o in found], np.int64),
+    )
+
+
+def usual_places(data: CocoData, size: tuple[int, int]) -> FloatArray:
+    """Middles [n, 2] of every object of the data set, in pixels of views of `size`."""
+    middles: list[FloatArray] = [np.zeros((0, 2))]
+    for image in data.images:
+        fit = Letterbox.fit(image.width, image.height, size, "ultralytics")
+        found = np.array([o.box_px for o in data.objects[image.id]], np.float64).reshape(-1, 4)
+        box = fit.forward(found).astype(np.float64)
+        middles.append((box[:, :2] + box[:, 2:]) / 2)
+    return np.concatenate(middles)
+
+
+def _reduced(image: CocoImage, width: int, height: int) -> ImageArray:
+    """The picture at any scale that is not smaller than asked."""
+    if image.path.suffix.lower() not in (".jpg", ".jpeg"):
+        return read_picture(image)
+    try:
+        return JpegDecoder(1).decode(image.path.read_bytes(), width, height)
+    except OSError as error:
+        raise DataSetError(f"{image.path}: cannot be read ({error.strerror})") from error
+    except CaptureError:
+        return read_picture(image)  # a PNG by a JPEG's name, or it says what is wrong
+
+
+class Cutter:
+    """Cuts windows by `CropSettings`; holds what does not change from window to window."""
+
+    def __init__(self, settings: CropSettings, seed: int, usual_px: FloatArray) -> None:
+        """`usual_px` [n, 2]: middles of objects in all of the pictures, in pixels of the view."""
+        self._settings = settings
+        width, height = settings.window
+        random = np.random.default_rng([seed, 1])
+        self._noise = [
+            np.rint(random.normal(0, strength, (height, width, 3))).astype(np.int16)
+            for strength in np.linspace(1, _NOISIEST, _NOISES)
+        ]
+        self._usual = usual_px
+
+    def __call__(self, view: View, random: np.random.Generator) -> Crop:
+        """One window of `view`."""
+        width, height = self._settings.window
+        scale = float(random.uniform(*self._settings.scale))
+        left, top = self._corner(view, width / scale, height / scale, random)
+        flip = random.random() < self._settings.flip
+        move = np.array([[scale, 0.0, -left * scale], [0.0, scale, -top * scale]])
+        if flip:
+            move[0] = [-scale, 0.0, width + left * scale]
+        # A point between pixels: the window's own first pixel covers scale times as much.
+        middle = np.array([(move[0, 0] - 1) / 2, (scale - 1) / 2])
+        warp = move.copy()
+        warp[:, 2] += middle
+        rgb = np.asarray(
+            cv2.warpAffine(
+                view.rgb,
+                warp,
+                (width, height),
+                flags=cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=(PAD, PAD, PAD),
+            ),
+            np.uint8,
+        )
+        box = view.box_px * scale - np.array([left, top, left, top]) * scale
+        if flip:
+            box[:, [0, 2]] = width - box[:, [2, 0]]
+        crop = _sorted_out(rgb, box, view, (width, height))
+        if random.random() < self._settings.cover and len(crop.box_px):
+            _cover(crop, random)
+        if random.random() < self._settings.light:
+            return Crop(self._relit(crop.rgb, random), crop.box_px, crop.class_id, crop.ignored_px)
+        return crop
+
+    def _corner(
+        self, view: View, wide: float, high: float, random: np.random.Generator
+    ) -> tuple[float, float]:
+        """Upper left corner of a window of `wide` x `high` pixels of the view."""
+        across, down = self._settings.view
+        count = len(view.box_px)
+        kind = random.random() - self._settings.around_object
+        if count and kind < 0:
+            box = view.box_px[int(random.integers(count))]
+            middle = (box[:2] + box[2:]) / 2
+            left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)
+        elif len(self._usual) and kind < self._settings.around_usual:
+            middle = self._usual[int(random.integers(len(self._usual)))]
+            left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)
+        else:
+            left, top = random.uniform(0, 1, 2) * (across - wide, down - high)
+        # The window stays on the view as far as it fits, as the camera's picture does.
+        return (
+            float(np.clip(left, min(0, across - wide), max(0, across - wide))),
+            float(np.clip(top, min(0, down - high), max(0, down - high))),
+        )
+
+    def _relit(self, rgb: ImageArray, random: np.random.Generator) -> ImageArray:
+        """Another exposure, white balance, contrast, blur and noise."""
+        value = np.arange(256) / 255.0
+        gamma = np.exp(random.uniform(-0.4, 0.4))
+        gain = np.exp(random.uniform(-0.35, 0.35)) * np.exp(random.uniform(-0.12, 0.12, 3))
+        lift = random.uniform(-0.08, 0.08)
+        tables = ((value**gamma)[:, None] * gain + lift).clip(0, 1) * 255
+        out = np.asarray(cv2.LUT(rgb, tables.astype(np.uint8).reshape(256, 1, 3)), np.uint8)
+        if random.random() < 0.3:  # paler, or stronger colours
+            grey = cv2.cvtColor(cv2.cvtColor(out, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+            share = float(random.uniform(-0.3, 1.0))
+            out = np.asarray(cv2.addWeighted(out, 1 - share, grey, share, 0), np.uint8)
+        if random.random() < 0.25:
+            out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(random.uniform(0.3, 0.9))))
+        if random.random() < 0.4:
+            noise = self._noise[int(random.integers(_NOISES))]
+            out = np.asarray(cv2.add(out, noise, dtype=cv2.CV_8U), np.uint8)
+        return out
+
+
+def _sorted_out(rgb: ImageArray, box: FloatArray, view: View, size: tuple[int, int]) -> Crop:
+    """Which objects are in the window, and which of them cannot be asked for."""
+    width, height = size
+    inside = np.clip(box, 0, (width, height, width, height))
+    area = np.prod(np.maximum(box[:, 2:] - box[:, :2], 1e-9), axis=1)
+    side = inside[:, 2:] - inside[:, :2]
+    left = np.prod(np.maximum(side, 0), axis=1)
+    seen = left > 0
+    good = seen & (left >= _LEAST_SHARE * area) & (side.max(axis=1) >= _LEAST_SIDE_PX)
+    good &= (side.min(axis=1) >= _LEAST_SIDE_PX / 2) & (view.crowd == 0)
+    return Crop(rgb, inside[good], view.class_id[good], inside[seen & ~good])
+
+
+def _cover(crop: Crop, random: np.random.Generator) -> None:
+    """Paints a plain patch over up to a quarter of an object, in place."""
+    box = crop.box_px[int(random.integers(len(crop.box_px)))]
+    share = random.uniform(0.2, 0.5, 2)
+    size = (box[2:] - box[:2]) * share
+    corner = box[:2] + random.uniform(0, 1, 2) * (box[2:] - box[:2] - size)
+    u1, v1 = np.floor(corner).astype(int)
+    u2, v2 = np.ceil(corner + size).astype(int)
+    crop.rgb[max(v1, 0) : v2, max(u1, 0) : u2] = random.integers(0, 256, 3)

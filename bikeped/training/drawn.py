@@ -1,0 +1,122 @@
+"""Drawn pictures to learn from: many streets, lights and cameras, every part from its own seed.
+
+Six parts in ten are seen by the configured camera, moved and turned a little; the others through
+fisheye lenses, heights and pitches of every kind. Street, place, light, weather, clothes and who is
+about follow from the seeds of `bikeped.scene`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from bikeped.config import LoadedConfig
+from bikeped.errors import DataSetError
+from bikeped.files import make_folder
+from bikeped.geometry import CameraPose
+from bikeped.scene import DEFAULT_POSE, SceneCamera, scene_camera, write_dataset
+from bikeped.training.coco import write_annotations
+
+#: Seeds of parts begin here, so that no set shares a street with another: training from
+#: `seed` * this, below the next one.
+SEEDS_A_SET = 10_000
+_SMALL, _LARGE = (960, 540), (1920, 1080)
+
+
+@dataclass(frozen=True)
+class DrawnSettings:
+    """How many pictures, of what kind."""
+
+    pictures: int = 4000
+    seed: int = 1
+    part: int = 20  #: pictures that share a camera
+    configured: float = 0.6  #: share of parts seen by the configured camera
+    large: float = 0.2  #: share of parts drawn at 1920 x 1080, the others at 960 x 540
+    lens: str = "fisheye"  #: of the other cameras: fisheye or rectilinear
+    processes: int = 2
+
+
+def draw_set(
+    folder: Path,
+    settings: DrawnSettings,
+    loaded: LoadedConfig,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Path:
+    """Draws a set into `folder` (new, or empty) and returns its annotation file.
+
+    The same settings and configuration give the same pictures, whatever the number of processes.
+    Raises DataSetError where the folder is taken.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataSetError(f"{folder}: is there already; choose another folder or remove it")
+    make_folder(folder)
+    parts = -(-settings.pictures // settings.part)
+    if parts > SEEDS_A_SET:
+        raise DataSetError(f"pictures: {settings.pictures} are more than a set can have")
+    jobs = [
+        (folder, number, min(settings.part, settings.pictures - number * settings.part))
+        for number in range(parts)
+    ]
+    images: list[dict[str, Any]] = []
+    notes: list[dict[str, Any]] = []
+    header: dict[str, Any] = {}
+    with ProcessPoolExecutor(settings.processes, mp_context=get_context("spawn")) as pool:
+        answers = [pool.submit(_draw, *job, settings, loaded) for job in jobs]
+        for answer in answers:
+            data = json.loads(answer.result().read_text(encoding="utf-8"))
+            part = answer.result().parent.name
+            shift_image, shift_note = len(images), len(notes)
+            for image in data["images"]:
+                name = f"{part}/images/{image['file_name']}"
+                images.append(image | {"id": image["id"] + shift_image, "file_name": name})
+            notes += [
+                note
+                | {
+                    "id": note["id"] + shift_note,
+                    "image_id": note["image_id"] + shift_image,
+                }
+                for note in data["annotations"]
+            ]
+            header = {"info": {"description": "drawn by bikeped"}, "categories": data["categories"]}
+            progress(len(images))
+    write_annotations(folder / "annotations.json", header, images, notes)
+    return folder / "annotations.json"
+
+
+def part_camera(
+    settings: DrawnSettings, number: int, loaded: LoadedConfig
+) -> tuple[SceneCamera | None, tuple[int, int]]:
+    """The camera of a part (None: one of `bikeped.scene`'s own for every street) and the size."""
+    random = np.random.default_rng([settings.seed, number, 7])
+    size = _LARGE if random.random() < settings.large else _SMALL
+    if random.random() >= settings.configured:
+        return None, size
+    pose = CameraPose(
+        DEFAULT_POSE.x_m + float(random.uniform(-2.5, 2.5)),
+        DEFAULT_POSE.y_m + float(random.uniform(-1.5, 1.5)),
+        DEFAULT_POSE.heading_deg + float(random.uniform(-15, 15)),
+    )
+    return scene_camera(loaded, size, pose), size
+
+
+def _draw(
+    folder: Path, number: int, count: int, settings: DrawnSettings, loaded: LoadedConfig
+) -> Path:
+    cv2.setNumThreads(1)
+    camera, size = part_camera(settings, number, loaded)
+    return write_dataset(
+        folder / f"{number:04d}",
+        count,
+        settings.seed * SEEDS_A_SET + number,
+        camera,
+        size=size,
+        lens=settings.lens,
+    )

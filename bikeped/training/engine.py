@@ -1,0 +1,118 @@
+"""A TensorRT engine from an ONNX file, built on the machine that will run it.
+
+An engine fits one GPU and one TensorRT version, so it is built on the Jetson itself, through the
+system's `tensorrt` package. In front of it stands what `bikeped.detection` reads: four bytes of
+length, little-endian, and that many bytes of JSON (as Ultralytics writes it).
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bikeped.detection.facts import parse_metadata
+from bikeped.errors import DetectorError
+from bikeped.files import write_whole
+
+_MB = 1 << 20
+_OLDEST = 10  #: TensorRT's major version; JetPack 6 has 10
+
+
+@dataclass(frozen=True)
+class EngineSummary:
+    """What was built."""
+
+    path: Path
+    source: Path
+    bytes: int
+    tensorrt: str
+    half: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "engine": str(self.path),
+            "from": str(self.source),
+            "engine_bytes": self.bytes,
+            "tensorrt": self.tensorrt,
+            "half_precision": self.half,
+        }
+
+
+def build_engine(
+    model: Path, out: Path, *, half: bool = True, workspace_mb: int = 2048
+) -> EngineSummary:
+    """Builds `out` from the ONNX file `model`; takes minutes. Raises DetectorError.
+
+    `half` lets TensorRT use 16-bit floats where the GPU has fast ones; `workspace_mb` bounds the
+    memory that it tries plans with.
+    """
+    trt = _tensorrt(out)
+    try:
+        content = model.read_bytes()
+    except OSError as error:
+        raise DetectorError(f"{model}: cannot be read ({error.strerror})") from error
+    facts = onnx_facts(model)
+    parse_metadata(facts, str(model))  # what the loader would refuse is refused now
+    logger = trt.Logger(trt.Logger.WARNING)
+    builder = trt.Builder(logger)
+    # TensorRT 10 knows explicit batches only, and takes no flag for them.
+    network = builder.create_network(0)
+    parser = trt.OnnxParser(network, logger)
+    if not parser.parse(content):
+        reasons = [" ".join(str(parser.get_error(i)).split()) for i in range(parser.num_errors)]
+        raise DetectorError(
+            f"{model}: TensorRT {trt.__version__} does not understand it ({'; '.join(reasons)}); "
+            "export with a lower opset"
+        )
+    config = builder.create_builder_config()
+    config.set_memory_pool_limit(trt.MemoryPoolType.WORKSPACE, workspace_mb * _MB)
+    half = half and bool(builder.platform_has_fast_fp16)
+    if half:
+        config.set_flag(trt.BuilderFlag.FP16)
+    plan = builder.build_serialized_network(network, config)
+    if plan is None:
+        raise DetectorError(
+            f"{model}: TensorRT {trt.__version__} built no engine; its log says why. Free memory, "
+            "or lower --workspace-mb"
+        )
+    header = json.dumps(facts).encode("utf-8")
+    data = len(header).to_bytes(4, "little") + header + bytes(plan)
+    write_whole(out, data)
+    return EngineSummary(out, model, len(data), str(trt.__version__), half)
+
+
+def onnx_facts(model: Path) -> dict[str, str]:
+    """The metadata of an ONNX file; DetectorError where ONNX Runtime cannot load it."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(
+            str(model), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # its errors share no class but this one
+        reason = " ".join(str(error).split())[:200]
+        raise DetectorError(f"{model}: is no ONNX model that can be loaded ({reason})") from error
+    return dict(session.get_modelmeta().custom_metadata_map)
+
+
+def _tensorrt(out: Path) -> Any:
+    try:
+        trt = importlib.import_module("tensorrt")
+    except ImportError as error:
+        raise DetectorError(
+            f"{out}: building an engine needs the system's `tensorrt` package ({error}); do it on "
+            "the Jetson, in a virtual environment made with --system-site-packages"
+        ) from error
+    major = str(trt.__version__).split(".", 1)[0]
+    if not major.isdigit() or int(major) < _OLDEST:
+        raise DetectorError(
+            f"{out}: TensorRT {trt.__version__} is too old; {_OLDEST} or later is needed "
+            "(JetPack 6)"
+        )
+    return trt

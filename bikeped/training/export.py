@@ -1,0 +1,153 @@
+"""From weights to what bikeped runs: an ONNX file with its facts inside, a TensorRT engine.
+
+The facts (class names, input size, task) are written as Ultralytics writes them, which is what
+`bikeped.detection` reads: text in the ONNX metadata, JSON in front of an engine.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bikeped import __version__
+from bikeped.errors import DetectorError
+from bikeped.files import write_whole
+from bikeped.training.fit import is_small, load_weights
+from bikeped.training.network import STRIDES, Exported, SmallNet
+
+_OPSET = 17
+#: ONNX Runtime joins and reorders operations: answers differ in the last digits. Boxes are pixels.
+_MOST_BOX_PX, _MOST_SCORE = 0.05, 1e-3
+
+
+@dataclass(frozen=True)
+class ExportSummary:
+    """What was written and how far its answers are from PyTorch's."""
+
+    path: Path
+    bytes: int
+    names: tuple[str, ...]
+    size: tuple[int, int]
+    box_difference_px: float
+    score_difference: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "model": str(self.path),
+            "bytes": self.bytes,
+            "names": list(self.names),
+            "size": list(self.size),
+            "largest_box_difference_px": self.box_difference_px,
+            "largest_score_difference": self.score_difference,
+        }
+
+
+def export_weights(weights: Path, out: Path) -> ExportSummary:
+    """Writes the small network's weights as ONNX. Raises DetectorError where that fails."""
+    network, names, size, facts = load_weights(weights)
+    return export_network(network, names, size, out, facts)
+
+
+def export_network(
+    network: SmallNet,
+    names: tuple[str, ...],
+    size: tuple[int, int],
+    out: Path,
+    facts: dict[str, Any],
+) -> ExportSummary:
+    """Writes `network` as ONNX and holds its answers against PyTorch's, before the file is there.
+
+    `size` is width and height of the input; `facts` go into the metadata as JSON.
+    """
+    width, height = size
+    whole = Exported(network.eval(), width, height).eval()
+    generator = torch.Generator().manual_seed(0)
+    picture = torch.rand((1, 3, height, width), generator=generator)
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        # The exporter that needs nothing but PyTorch is called deprecated since PyTorch 2.9.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            whole,
+            (picture,),
+            file,
+            opset_version=_OPSET,
+            dynamo=False,
+            input_names=["images"],
+            output_names=["output0"],
+        )
+    content = with_metadata(
+        file.getvalue(),
+        {
+            "author": f"bikeped {__version__}",
+            "task": "detect",
+            "names": repr(dict(enumerate(names))),
+            "imgsz": repr([height, width]),
+            "stride": str(STRIDES[-1]),
+            "bikeped": json.dumps(facts, sort_keys=True),
+        },
+    )
+    with torch.no_grad():
+        expected = whole(picture).numpy()
+    box, score = compare(content, picture.numpy(), expected, str(out))
+    write_whole(out, content)
+    return ExportSummary(out, len(content), names, size, box, score)
+
+
+def with_metadata(content: bytes, facts: dict[str, str]) -> bytes:
+    """An ONNX file's bytes with `facts` in its metadata, replacing what has their names."""
+    import onnx
+
+    model = onnx.load_model_from_string(content)
+    kept = {entry.key: entry.value for entry in model.metadata_props} | facts
+    onnx.helper.set_model_props(model, kept)
+    # The exporter's own path names tell about the machine and nothing about the model.
+    for node in model.graph.node:
+        node.ClearField("doc_string")
+    data: bytes = model.SerializeToString()
+    return data
+
+
+def compare(
+    content: bytes, picture: np.ndarray[Any, Any], expected: np.ndarray[Any, Any], source: str
+) -> tuple[float, float]:
+    """Largest differences of boxes (pixels) and scores between ONNX Runtime and `expected`.
+
+    Raises DetectorError where they are too large to be rounding.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    answer = np.asarray(session.run(None, {session.get_inputs()[0].name: picture})[0])
+    if answer.shape != expected.shape:
+        raise DetectorError(
+            f"{source}: ONNX Runtime answers {list(answer.shape)}, PyTorch {list(expected.shape)}; "
+            "export with another PyTorch or ONNX Runtime"
+        )
+    difference = np.abs(answer.astype(np.float64) - expected)
+    box, score = float(difference[:, :4].max()), float(difference[:, 4:].max())
+    if not (box <= _MOST_BOX_PX and score <= _MOST_SCORE):
+        raise DetectorError(
+            f"{source}: ONNX Runtime's answer differs from PyTorch's by {box:.3g} px and "
+            f"{score:.3g} in score; export with another PyTorch or ONNX Runtime"
+        )
+    return box, score
+
+
+def export_any(weights: Path, out: Path, size: int) -> dict[str, Any]:
+    """Exports whatever `model train` wrote: the small network's weights, or a YOLO's (`size`)."""
+    if not is_small(weights):
+        from bikeped.training.yolo import export_yolo
+
+        return export_yolo(weights, out, size)
+    return export_weights(weights, out).as_dict()

@@ -1,0 +1,302 @@
+"""Trains the small network on any data set in COCO's format: batches, steps, a mean of the weights.
+
+Same data, seed and settings give the same weights on the same kind of processor (PyTorch promises
+no more than that). Nothing depends on the time that anything takes.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from bikeped.errors import DataSetError, DetectorError
+from bikeped.files import write_whole
+from bikeped.training.coco import CocoData
+from bikeped.training.crops import Crop, CropSettings, Cutter, read_view, usual_places
+from bikeped.training.loss import Truth, detection_loss
+from bikeped.training.network import STRIDES, SmallNet, grid
+
+FORMAT = "bikeped small detector 1"
+_REPORT_EVERY = 100  #: steps
+_STEEPEST_GRADIENT = 10.0
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How long and how the network learns."""
+
+    steps: int = 6000
+    pictures: int = 8  #: read for each step
+    windows: int = 3  #: cut from each of them
+    rate: float = 2e-3  #: highest learning rate, of AdamW
+    decay: float = 0.02  #: of the weights
+    warmup: int = 300  #: steps until the highest rate
+    memory: float = 0.9995  #: of the running mean of the weights
+    seed: int = 0
+    workers: int = 2  #: threads, each with its part of every step
+    bfloat16: bool = True  #: half as long on processors that know it; the loss is always float32
+    device: str = "cpu"
+    crops: CropSettings = field(default_factory=CropSettings)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The trained network, what it knows, and how it came to be."""
+
+    network: SmallNet
+    names: tuple[str, ...]
+    size: tuple[int, int]  #: width and height of the input
+    losses: list[dict[str, float]]  #: means over every hundred steps
+    seconds: float
+
+
+def fit(
+    data: CocoData,
+    settings: FitSettings,
+    progress: Callable[[int], None] = lambda done: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Fitted:
+    """Trains on `data`; `progress` takes the steps done. Raises DataSetError for unusable data."""
+    _check(data, settings)
+    began = time.monotonic()
+    torch.manual_seed(settings.seed)
+    torch.set_num_threads(1)  # of each worker
+    torch.use_deterministic_algorithms(True, warn_only=settings.device != "cpu")
+    cv2.setNumThreads(1)
+    device = torch.device(settings.device)
+    network = SmallNet(len(data.categories)).to(device, memory_format=torch.channels_last).train()
+    mean = copy.deepcopy(network).eval()
+    optimiser = _optimiser(network, settings)
+    workers = _workers(network, data, settings)
+    losses: list[dict[str, float]] = []
+    sums: dict[str, float] = {}
+    with ThreadPoolExecutor(len(workers)) as pool:
+        for step in range(settings.steps):
+            for group in optimiser.param_groups:
+                group["lr"] = learning_rate(step, settings)
+            answers = [pool.submit(worker, step) for worker in workers]
+            for answer in answers:
+                for name, part in answer.result().items():
+                    sums[name] = sums.get(name, 0.0) + part / len(workers) / _REPORT_EVERY
+            _join(network, workers)
+            torch.nn.utils.clip_grad_norm_(network.parameters(), _STEEPEST_GRADIENT)
+            optimiser.step()
+            _average(mean, network, min(settings.memory, (1 + step) / (10 + step)))
+            progress(step + 1)
+            if (step + 1) % _REPORT_EVERY == 0:
+                losses.append({name: round(part, 4) for name, part in sums.items()})
+                sums = {}
+                spent = time.monotonic() - began
+                say(f"step {step + 1} of {settings.steps}, {spent:.0f} s: {losses[-1]}")
+    return Fitted(
+        mean.cpu().eval(),
+        tuple(data.categories.values()),
+        settings.crops.view,
+        losses,
+        time.monotonic() - began,
+    )
+
+
+def learning_rate(step: int, settings: FitSettings) -> float:
+    """Rises evenly over the warm-up, then falls along half a cosine to a fiftieth."""
+    if step < settings.warmup:
+        return settings.rate * (step + 1) / settings.warmup
+    done = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
+    return settings.rate * (0.02 + 0.98 * (1 + math.cos(math.pi * done)) / 2)
+
+
+def save_weights(fitted: Fitted, path: Path, facts: dict[str, Any]) -> None:
+    """Writes the network with its names, input size and `facts` (plain values), whole or not."""
+    file = io.BytesIO()
+    body = {
+        "format": FORMAT,
+        "names": list(fitted.names),
+        "size": list(fitted.size),
+        "facts": facts,
+        "weights": fitted.network.state_dict(),
+    }
+    torch.save(body, file)
+    write_whole(path, file.getvalue())
+
+
+def is_small(path: Path) -> bool:
+    """Whether a file holds weights of the small network; DetectorError where it holds none."""
+    return _read(path).get("format") == FORMAT
+
+
+def load_weights(path: Path) -> tuple[SmallNet, tuple[str, ...], tuple[int, int], dict[str, Any]]:
+    """Network, names, input size (width, height) and facts; DetectorError where it is no such file.
+
+    Nothing in the file is executed.
+    """
+    body = _read(path)
+    if body.get("format") != FORMAT:
+        raise DetectorError(
+            f"{path}: holds no weights of bikeped's small network; name the weights.pt that "
+            "`bikeped model train --network small` wrote"
+        )
+    try:
+        names = tuple(str(name) for name in body["names"])
+        width, height = (int(side) for side in body["size"])
+        network = SmallNet(len(names))
+        network.load_state_dict(body["weights"])
+        return network.eval(), names, (width, height), dict(body["facts"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DetectorError(f"{path}: its weights do not fit ({_line(error)})") from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        body = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise DetectorError(f"{path}: cannot be read ({error.strerror})") from error
+    except Exception as error:  # a damaged file raises anything
+        raise DetectorError(f"{path}: is no file of weights ({_line(error)})") from error
+    return body if isinstance(body, dict) else {}
+
+
+def settings_as_dict(settings: FitSettings) -> dict[str, Any]:
+    """The settings as plain values."""
+    return asdict(settings)
+
+
+class _Worker:
+    """A part of every step: reads its pictures, cuts its windows, and finds its own gradient.
+
+    Each runs on one thread of its own and answers for a copy of the network that shares the
+    weights. Threads within one operation would wait for one another thousands of times a step.
+    What is read follows from the seed, the step and the part alone.
+    """
+
+    def __init__(
+        self, network: SmallNet, data: CocoData, settings: FitSettings, part: int, cutter: Cutter
+    ) -> None:
+        self.network = network
+        self._data, self._settings, self._part, self._cutter = data, settings, part, cutter
+        self._device = next(network.parameters()).device
+        centre, stride = grid(*settings.crops.window)
+        self._centre, self._stride = centre.to(self._device), stride.to(self._device)
+
+    def __call__(self, step: int) -> dict[str, float]:
+        """Leaves the gradient in the copy; returns the parts of the loss."""
+        torch.set_num_threads(1)
+        pictures, truths = _tensors(self._crops(step), self._device)
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._settings.bfloat16):
+            score, edge = self.network(pictures)
+        loss, parts = detection_loss(score, edge, truths, self._centre, self._stride)
+        self.network.zero_grad()
+        loss.backward()
+        return parts
+
+    def _crops(self, step: int) -> list[Crop]:
+        settings = self._settings
+        random = np.random.default_rng([settings.seed, 2, step, self._part])
+        mine = range(step * settings.pictures, (step + 1) * settings.pictures)
+        crops = []
+        for number in mine[self._part :: settings.workers]:
+            image = self._data.images[self._picture(number)]
+            view = read_view(self._data, image, settings.crops.view)
+            crops += [self._cutter(view, random) for _ in range(settings.windows)]
+        return crops
+
+    def _picture(self, number: int) -> int:
+        """Every picture once a round, in another order each round."""
+        count = len(self._data.images)
+        turn, place = divmod(number, count)
+        return int(np.random.default_rng([self._settings.seed, 3, turn]).permutation(count)[place])
+
+
+def _workers(network: SmallNet, data: CocoData, settings: FitSettings) -> list[_Worker]:
+    """The first one's network is `network` itself; the others share its weights."""
+    cutter = Cutter(settings.crops, settings.seed, usual_places(data, settings.crops.view))
+    copies = [network]
+    for _ in range(settings.workers - 1):
+        other = copy.deepcopy(network)
+        for mine, shared in zip(other.parameters(), network.parameters(), strict=True):
+            mine.data = shared.data
+        copies.append(other)
+    return [_Worker(n, data, settings, part, cutter) for part, n in enumerate(copies)]
+
+
+def _join(network: SmallNet, workers: list[_Worker]) -> None:
+    """The mean of the workers' gradients and of their normalisations' statistics, in `network`."""
+    with torch.no_grad():
+        for own, *others in zip(*(w.network.parameters() for w in workers), strict=True):
+            if own.grad is not None:
+                for other in others:
+                    own.grad += other.grad
+                own.grad /= len(workers)
+        for own, *others in zip(*(w.network.buffers() for w in workers), strict=True):
+            if own.dtype.is_floating_point:
+                for other in others:
+                    own += other
+                own /= len(workers)
+                for other in others:
+                    other.copy_(own)
+
+
+def _tensors(crops: list[Crop], device: torch.device) -> tuple[torch.Tensor, list[Truth]]:
+    stacked = torch.from_numpy(np.stack([crop.rgb for crop in crops])).to(device)
+    # Channels last in memory is how the pictures lie already: this moves no bytes.
+    pictures = stacked.permute(0, 3, 1, 2).float() / 255
+    truths = [
+        Truth(
+            torch.from_numpy(crop.box_px).float().to(device),
+            torch.from_numpy(crop.class_id).to(device),
+            torch.from_numpy(crop.ignored_px).float().to(device),
+        )
+        for crop in crops
+    ]
+    return pictures, truths
+
+
+def _optimiser(network: SmallNet, settings: FitSettings) -> torch.optim.Optimizer:
+    """AdamW; biases and normalisations are not pulled to zero."""
+    weights = [p for p in network.parameters() if p.ndim > 1]
+    others = [p for p in network.parameters() if p.ndim <= 1]
+    groups = [{"params": weights, "weight_decay": settings.decay}, {"params": others}]
+    return torch.optim.AdamW(groups, lr=settings.rate, weight_decay=0.0)
+
+
+def _average(mean: SmallNet, network: SmallNet, share: float) -> None:
+    """Moves the running mean of weights (and of normalisation's statistics) on by one step."""
+    with torch.no_grad():
+        for kept, new in zip(
+            mean.state_dict().values(), network.state_dict().values(), strict=True
+        ):
+            if kept.dtype.is_floating_point:
+                kept.lerp_(new, 1 - share)
+            else:
+                kept.copy_(new)
+
+
+def _check(data: CocoData, settings: FitSettings) -> None:
+    sides = (*settings.crops.view, *settings.crops.window)
+    if any(side % STRIDES[-1] for side in sides):
+        raise DataSetError(
+            f"size {sides}: sides must be multiples of {STRIDES[-1]}; choose another --size"
+        )
+    if settings.pictures % settings.workers:
+        raise DataSetError(
+            f"batch {settings.pictures}: must be a multiple of {settings.workers}, so that each "
+            "worker has as many pictures; choose another --batch"
+        )
+    if not data.categories:
+        raise DataSetError(f"{data.source}: categories: is empty; name at least one class")
+    if not any(not o.crowd for found in data.objects.values() for o in found):
+        raise DataSetError(f"{data.source}: holds no object to learn from")
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,167 @@
+"""Our own small detector: a convolutional network of 660,000 weights.
+
+One stage, no anchors: three grids of strides 8, 16 and 32 pixels, each cell of which says how
+likely a road user of each class has its middle there and how far its four edges are from the cell's
+own centre. Only plain convolutions and ReLU, which every runtime has fast code for.
+
+    stem    3 -> 16 -> 32 channels at 1/4 of the picture's size
+    stages  64, 128, 160 channels at 1/8, 1/16, 1/32; each a few convolutions on half of the
+            channels, whose answers are all joined (as in CSP and ELAN networks)
+    neck    from coarse to fine, so that small figures are seen with what surrounds them
+    heads   one convolution, then scores and edges
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import nn
+
+STRIDES = (8, 16, 32)
+#: A cell says `road user` this rarely before it has learnt anything (RetinaNet, section 4.1).
+_PRIOR = 0.01
+
+
+class _Conv(nn.Module):
+    """Convolution, batch normalisation, ReLU."""
+
+    def __init__(self, taken: int, given: int, size: int = 3, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(taken, given, size, stride, size // 2, bias=False)
+        self.norm = nn.BatchNorm2d(given, eps=1e-3, momentum=0.03)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.relu(self.norm(self.conv(x)))
+
+
+class _Stage(nn.Module):
+    """`count` convolutions in a row on half of the channels; all of their answers are joined."""
+
+    def __init__(self, channels: int, count: int) -> None:
+        super().__init__()
+        half = channels // 2
+        self.enter = _Conv(channels, channels, 1)
+        self.steps = nn.ModuleList([_Conv(half, half) for _ in range(count)])
+        self.leave = _Conv(half * (2 + count), channels, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        parts = list(self.enter(x).chunk(2, 1))
+        for step in self.steps:
+            parts.append(step(parts[-1]))
+        return self.leave(torch.cat(parts, 1))
+
+
+class _Head(nn.Module):
+    """Scores (before the sigmoid) and edges (in strides) of one grid."""
+
+    def __init__(self, channels: int, classes: int) -> None:
+        super().__init__()
+        self.trunk = _Conv(channels, channels)
+        self.score = nn.Conv2d(channels, classes, 1)
+        self.edge = nn.Conv2d(channels, 4, 1)
+        nn.init.constant_(self.score.bias, -math.log((1 - _PRIOR) / _PRIOR))
+        nn.init.constant_(self.edge.bias, 1.0)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        x = self.trunk(x)
+        return self.score(x).flatten(2), self.edge(x).flatten(2)
+
+
+class SmallNet(nn.Module):
+    """Pictures [n, 3, h, w], RGB in 0..1, sides multiples of 32; see `forward` and `detect`."""
+
+    def __init__(
+        self,
+        classes: int,
+        widths: tuple[int, ...] = (16, 32, 64, 128, 160),
+        depths: tuple[int, ...] = (2, 2, 1),
+        neck: int = 48,
+    ) -> None:
+        super().__init__()
+        self.classes = classes
+        first, second, *stages = widths
+        self.stem = nn.Sequential(_Conv(3, first, stride=2), _Conv(first, second, stride=2))
+        self.stages = nn.ModuleList()
+        taken = second
+        for given, count in zip(stages, depths, strict=True):
+            self.stages.append(nn.Sequential(_Conv(taken, given, stride=2), _Stage(given, count)))
+            taken = given
+        self.lateral = nn.ModuleList([_Conv(given, neck, 1) for given in stages])
+        self.merge = nn.ModuleList([_Stage(neck, 1) for _ in stages[:-1]])
+        self.heads = nn.ModuleList([_Head(neck, classes) for _ in stages])
+
+    def forward(self, pictures: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Scores before the sigmoid [n, classes, cells] and edges [n, 4, cells].
+
+        Edges are the distances from the cell's centre to the box's left, top, right and bottom, in
+        strides. Cells run through the grids of `STRIDES` one after another, row by row.
+        """
+        x = self.stem(pictures)
+        maps = []
+        for stage, lateral in zip(self.stages, self.lateral, strict=True):
+            x = stage(x)
+            maps.append(lateral(x))
+        for i in reversed(range(len(self.merge))):
+            maps[i] = self.merge[i](
+                maps[i] + nn.functional.interpolate(maps[i + 1], scale_factor=2)
+            )
+        answers = [head(x) for head, x in zip(self.heads, maps, strict=True)]
+        return torch.cat([a[0] for a in answers], 2), torch.cat([a[1] for a in answers], 2)
+
+
+class Exported(nn.Module):
+    """The network with its answer in the layout `yolov8`: [n, 4 + classes, cells].
+
+    Rows: centre u, centre v, width, height in pixels of the input, then a score in 0..1 a class.
+    """
+
+    def __init__(self, network: SmallNet, width: int, height: int) -> None:
+        super().__init__()
+        self.network = network
+        centre, stride = grid(width, height)
+        self.register_buffer("centre", centre.T[None].contiguous())
+        self.register_buffer("stride", stride[None, None])
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        score, edge = self.network(images)
+        low, high = edge[:, :2], edge[:, 2:]
+        middle = self.centre + (high - low) * (self.stride / 2)
+        return torch.cat([middle, (low + high) * self.stride, score.sigmoid()], 1)
+
+
+def grid(width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Centre [cells, 2] (u, v) and stride [cells] of every cell, in pixels of the input."""
+    centres, strides = [], []
+    for stride in STRIDES:
+        v, u = torch.meshgrid(
+            torch.arange(height // stride), torch.arange(width // stride), indexing="ij"
+        )
+        centres.append((torch.stack([u.flatten(), v.flatten()], 1) + 0.5) * stride)
+        strides.append(torch.full((u.numel(),), float(stride)))
+    return torch.cat(centres), torch.cat(strides)
+
+
+def boxes_px(edge: torch.Tensor, centre: torch.Tensor, stride: torch.Tensor) -> torch.Tensor:
+    """Corners [n, cells, 4] (u1, v1, u2, v2) in pixels, of edges [n, 4, cells]."""
+    reach = edge.permute(0, 2, 1) * stride[None, :, None]
+    return torch.cat([centre - reach[..., :2], centre + reach[..., 2:]], 2)
+
+
+def multiply_adds(network: Any, width: int, height: int) -> int:
+    """Multiplications of the convolutions for one picture: what inference mostly costs."""
+    total = 0
+
+    def count(module: Any, _: Any, answer: torch.Tensor) -> None:
+        nonlocal total
+        total += answer[0].numel() * module.weight[0].numel()
+
+    hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
+    training = network.training
+    with torch.no_grad():
+        network.eval()(torch.zeros(1, 3, height, width))
+    network.train(training)
+    for hook in hooks:
+        hook.remove()
+    return total

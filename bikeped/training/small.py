@@ -1,0 +1,88 @@
+"""Trains our own small network on a data set and leaves weights, ONNX and what was done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bikeped.errors import DetectorError
+from bikeped.training.coco import CocoData
+from bikeped.training.crops import CropSettings
+from bikeped.training.export import export_network
+from bikeped.training.fit import FitSettings, fit, save_weights, settings_as_dict
+
+
+@dataclass(frozen=True)
+class SmallOrder:
+    """What is asked for; the rest is `FitSettings`' own."""
+
+    steps: int = 6000
+    pictures: int = 8  #: for each step
+    seed: int = 0
+    device: str = "auto"
+    crops: CropSettings = field(default_factory=CropSettings)
+    facts: dict[str, Any] = field(default_factory=dict)  #: travel in the weights and the model
+
+
+def train_small(
+    data: CocoData,
+    out: Path,
+    order: SmallOrder,
+    progress: Callable[[int], None] = lambda done: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Writes `out`/weights.pt and `out`/model.onnx; returns what was done, for JSON.
+
+    Raises DataSetError and DetectorError.
+    """
+    device = _device(order.device)
+    on_cpu = device == "cpu"
+    settings = FitSettings(
+        steps=order.steps,
+        pictures=order.pictures,
+        warmup=min(300, max(1, order.steps // 10)),
+        workers=2 if on_cpu and order.pictures % 2 == 0 else 1,
+        seed=order.seed,
+        device=device,
+        crops=order.crops,
+    )
+    fitted = fit(data, settings, progress, say)
+    facts = order.facts | {"data_sha256": data.sha256, "steps": order.steps, "seed": order.seed}
+    weights, model = out / "weights.pt", out / "model.onnx"
+    save_weights(fitted, weights, facts)
+    exported = export_network(fitted.network, fitted.names, fitted.size, model, facts)
+    return {
+        "network": "small",
+        "data": str(data.source),
+        "data_sha256": data.sha256,
+        "pictures": len(data.images),
+        "objects": data.count,
+        "names": list(fitted.names),
+        "size": list(fitted.size),
+        "weights": str(weights),
+        "model": str(model),
+        "model_bytes": exported.bytes,
+        "seconds": round(fitted.seconds, 1),
+        "device": device,
+        "torch": torch.__version__,
+        "settings": settings_as_dict(settings),
+        "losses": fitted.losses,
+    }
+
+
+def _device(asked: str) -> str:
+    if asked == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    device = f"cuda:{asked}" if asked.isdigit() else asked
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise DetectorError(
+            f"--device {asked}: cannot be used ({reason}); use cpu or auto"
+        ) from error
+    return device

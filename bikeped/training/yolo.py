@@ -1,0 +1,243 @@
+"""A real YOLO (YOLOv9) through LibreYOLO, a library under the MIT licence.
+
+The library reads COCO's format itself; what is done here is to hand it the data as bikeped read
+them, to have it letterbox as `bikeped.detection` does (picture centred), and to export with the
+facts that `bikeped.detection` reads. Nothing is downloaded: the network starts from the weights
+that are named, or from scratch.
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import tempfile
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bikeped.errors import DataSetError, DetectorError
+from bikeped.files import make_folder, write_whole
+from bikeped.training.coco import CocoData, CocoImage, write_annotations
+from bikeped.training.export import with_metadata
+from bikeped.training.needs import need
+
+_VALIDATION_SHARE = 20  #: one picture in so many, where no validation set is named
+_OPSET = 17
+
+
+@dataclass(frozen=True)
+class YoloOrder:
+    """What is asked of the library."""
+
+    network: str = "yolov9-s"  #: yolov9-t, -s, -m, -c
+    size: int = 1280
+    epochs: int = 100
+    batch: int = 8
+    weights: Path | None = None
+    device: str = "auto"
+    workers: int = 4
+    seed: int = 0
+
+
+def train_yolo(
+    data: CocoData, validation: CocoData | None, out: Path, order: YoloOrder
+) -> dict[str, Any]:
+    """Trains and exports; writes `out`/weights.pt and `out`/model.onnx, returns what was done.
+
+    The epoch that does best on `validation` is kept; without one, a twentieth of `data` is held
+    back for it. Raises DataSetError and DetectorError.
+    """
+    if order.size % 32:
+        raise DataSetError(f"--size {order.size}: must be a multiple of 32; choose another")
+    model = _load(order.weights, order.network.removeprefix("yolov9-"), order.device)
+    began = time.monotonic()
+    description = write_data(data, validation, out / "data", order.seed)
+    answer = model.train(
+        data=str(description),
+        epochs=order.epochs,
+        batch=order.batch,
+        imgsz=order.size,
+        device="" if order.device == "auto" else order.device,
+        workers=order.workers,
+        seed=order.seed,
+        project=str(out / "runs"),
+        name="train",
+        exist_ok=True,
+        letterbox_pad="center",
+    )
+    best = Path(str(answer.get("best_checkpoint") or ""))
+    if not best.is_file():
+        raise DetectorError(f"{out / 'runs'}: LibreYOLO left no weights; see its log there")
+    weights = out / "weights.pt"
+    write_whole(weights, best.read_bytes())
+    exported = export_yolo(weights, out / "model.onnx", order.size)
+    order_json = asdict(order) | {"weights": None if order.weights is None else str(order.weights)}
+    return {
+        "network": order.network,
+        "library": f"libreyolo {_version('libreyolo')}",
+        "data": str(data.source),
+        "data_sha256": data.sha256,
+        "pictures": len(data.images),
+        "objects": data.count,
+        "names": exported["names"],
+        "size": exported["size"],
+        "weights": str(weights),
+        "model": exported["model"],
+        "model_bytes": exported["bytes"],
+        "seconds": round(time.monotonic() - began, 1),
+        "device": order.device,
+        "torch": _version("torch"),
+        "settings": order_json,
+        "results": {k: v for k, v in answer.items() if isinstance(v, int | float | str)},
+    }
+
+
+def export_yolo(weights: Path, out: Path, size: int) -> dict[str, Any]:
+    """Exports weights that LibreYOLO trained, for a square input; what was written, for JSON.
+
+    The library itself compares nothing: the answer is held against PyTorch's here. Raises
+    DetectorError.
+    """
+    from bikeped.training.export import compare
+
+    model = _load(weights, None, "cpu")
+    names = [str(model.names[i]) for i in range(len(model.names))]
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder) / "model.onnx"
+        model.export(
+            "onnx",
+            output_path=str(draft),
+            imgsz=size,
+            opset=_OPSET,
+            dynamic=False,
+            simplify=False,
+            device="cpu",
+        )
+        content = with_metadata(
+            draft.read_bytes(),
+            {
+                "task": "detect",
+                "names": repr(dict(enumerate(names))),
+                "imgsz": repr([size, size]),
+                "stride": "32",
+            },
+        )
+    picture = np.random.default_rng(0).random((1, 3, size, size), np.float32)
+    box, score = compare(content, picture, _torch_answer(model, picture), str(out))
+    write_whole(out, content)
+    return {
+        "model": str(out),
+        "bytes": len(content),
+        "names": names,
+        "size": [size, size],
+        "largest_box_difference_px": box,
+        "largest_score_difference": score,
+    }
+
+
+def write_data(data: CocoData, validation: CocoData | None, folder: Path, seed: int) -> Path:
+    """Writes the library's description of the data (pictures stay where they are); its path."""
+    images = list(data.images)
+    if validation is None:
+        if len(images) < 2:
+            raise DataSetError(f"{data.source}: one picture is too few; name --validation, too")
+        order = np.random.default_rng(seed).permutation(len(images))
+        held = set(order[: max(1, len(images) // _VALIDATION_SHARE)].tolist())
+        parts = [
+            (data, [image for i, image in enumerate(images) if i not in held]),
+            (data, [image for i, image in enumerate(images) if i in held]),
+        ]
+    else:
+        if list(validation.categories.values()) != list(data.categories.values()):
+            raise DataSetError(
+                f"{validation.source}: categories: are not those of {data.source}; use the same, "
+                "in the same order"
+            )
+        parts = [(data, images), (validation, list(validation.images))]
+    shutil.rmtree(folder, ignore_errors=True)
+    make_folder(folder)
+    lines = [f"path: {_quoted(folder.resolve())}"]
+    for name, (source, chosen) in zip(("train", "val"), parts, strict=True):
+        _write_part(folder / f"{name}.json", source, chosen)
+        lines.append(f"{name}: {_quoted(_root(source))}")
+    lines.append("annotations:")
+    lines += [
+        f"  {name}: {_quoted(folder.resolve() / f'{name}.json')}" for name in ("train", "val")
+    ]
+    lines += [f"nc: {len(data.categories)}", "names:"]
+    lines += [f"  {i}: {_quoted(name)}" for i, name in enumerate(data.categories.values())]
+    write_whole(folder / "data.yaml", "\n".join(lines) + "\n")
+    return folder / "data.yaml"
+
+
+def _write_part(path: Path, source: CocoData, images: Iterable[CocoImage]) -> None:
+    chosen = list(images)
+    notes = [
+        {
+            "id": found.id,
+            "image_id": found.image_id,
+            "category_id": found.category_id,
+            "bbox": [u1, v1, u2 - u1, v2 - v1],
+            "area": (u2 - u1) * (v2 - v1),
+            "iscrowd": int(found.crowd),
+        }
+        for image in chosen
+        for found in source.objects[image.id]
+        for u1, v1, u2, v2 in [found.box_px]
+    ]
+    entries = [
+        {"id": i.id, "file_name": i.file_name, "width": i.width, "height": i.height} for i in chosen
+    ]
+    categories = [{"id": key, "name": name} for key, name in source.categories.items()]
+    write_annotations(path, {"categories": categories}, entries, notes)
+
+
+def _root(data: CocoData) -> Path:
+    """The folder that the file names start from."""
+    image = data.images[0]
+    return Path(*image.path.resolve().parts[: -len(Path(image.file_name).parts)])
+
+
+def _quoted(value: object) -> str:
+    """A YAML string in single quotes."""
+    return "'" + str(value).replace("'", "''") + "'"
+
+
+def _load(weights: Path | None, size: str | None, device: str) -> Any:
+    """The library's model: from `weights`, or a fresh one of `size`."""
+    need("libreyolo", "model train and export of a YOLO")
+    library = importlib.import_module("libreyolo")
+    if weights is not None and not weights.is_file():
+        # The library would look for it on the network.
+        raise DetectorError(f"{weights}: does not exist; name a file of weights")
+    try:
+        if weights is None:
+            model = library.LibreYOLO9(None, size, device=device)
+        else:
+            model = library.LibreYOLO(str(weights), device=device)
+    except Exception as error:  # its errors share no class but this one
+        reason = " ".join(str(error).split())[:200]
+        raise DetectorError(f"{weights or size}: LibreYOLO cannot use it ({reason})") from error
+    if type(model).__name__ != "LibreYOLO9":
+        raise DetectorError(f"{weights}: is a {type(model).__name__}; bikeped exports YOLOv9 only")
+    return model
+
+
+def _torch_answer(model: Any, picture: Any) -> Any:
+    torch = importlib.import_module("torch")
+    network = model.model.eval()
+    with torch.no_grad():
+        answer = network(torch.from_numpy(picture))
+    while not hasattr(answer, "shape"):  # the library answers a table of tensors
+        answer = answer["predictions"] if isinstance(answer, dict) else answer[0]
+    return answer.numpy()
+
+
+def _version(library: str) -> str:
+    from importlib.metadata import version
+
+    return version(library)
