@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from rich.markup import escape
@@ -10,11 +13,14 @@ from rich.markup import escape
 from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
 from bikeped.cli.conformance_shared import scenarios_option
 from bikeped.cli.governance_tables import print_contest
-from bikeped.cli.guard import guarded
+from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config import LoadedConfig, load_config
 from bikeped.conformance.scenario import Scenario, bundled_folder, load_scenarios
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
+
+if TYPE_CHECKING:
+    from bikeped.web.testbench_settings import Bench
 
 
 @click.group("testbench", invoke_without_command=True)
@@ -22,7 +28,6 @@ from bikeped.files import write_whole
 @scenarios_option
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to serve; 0: any free one.")
 @click.option("--host", help="Address to serve; any but this machine's own needs web.token_file.")
-@click.pass_context
 @guarded
 def command(
     config_path: Path | None,
@@ -89,15 +94,15 @@ def contest(
     from bikeped.web.testbench_run import Workbench, trial_summaries
     from bikeped.web.testbench_settings import in_force, parse_link
 
+    file = _as_file(challenge)
+    if file is not None and json_path not in (None, "-"):
+        check_outputs([("FILE", file)], [("--json", Path(str(json_path)))])
     loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
-    if Path(challenge).is_file() or not ("#" in challenge or "=" in challenge):
-        bench = _read(Path(challenge))
-    else:
-        bench = parse_link(challenge, in_force(loaded))
+    bench = parse_link(challenge, in_force(loaded)) if file is None else _read(file)
     work = Workbench(loaded, scenarios)
     found = run(work, bench).as_dict()
     trials = trial_summaries(work.whole(bench), bench)
-    words = "bikeped testbench contest " + challenge
+    words = shlex.join(["bikeped", "testbench", "contest", challenge])
     if json_path is not None:
         write_json({"command": words, **found, "trials": trials}, json_path)
     print_contest(found, words, json_path)
@@ -145,7 +150,17 @@ def _begin(
     return loaded, load_scenarios(scenarios_dir or bundled_folder())
 
 
-def _read(path: Path) -> object:
+def _as_file(challenge: str) -> Path | None:
+    """The file that is meant; None for a link."""
+    if "=" not in challenge and "#" not in challenge:
+        return Path(challenge)
+    with contextlib.suppress(OSError, ValueError):  # a link can be longer than any name
+        if Path(challenge).is_file():
+            return Path(challenge)
+    return None
+
+
+def _read(path: Path) -> Bench:
     from bikeped.web.testbench_settings import parse_file
 
     try:
@@ -157,8 +172,6 @@ def _read(path: Path) -> object:
 
 
 def _again(config_path: Path | None, overrides: tuple[str, ...], scenarios_dir: Path | None) -> str:
-    import shlex
-
     words = ["bikeped", "testbench", "export", "report.html"]
     words += ["-c", str(config_path)] if config_path is not None else []
     words += ["--scenarios", str(scenarios_dir)] if scenarios_dir is not None else []

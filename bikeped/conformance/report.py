@@ -69,12 +69,12 @@ def write_index(
     relative paths; returns its path. BikepedError names a file that cannot be written."""
     found = {r.name: r for r in results}
     sections = [
-        ("verdict", "Verdict", _verdict(found)),
-        ("tested", "What was tested", _tested(found, provenance)),
+        ("verdict", "Verdict", verdict_html(found)),
+        ("tested", "What was tested", tested_html(found, provenance)),
         ("figures", "Figures", _figures(folder, figures)),
         ("tables", "Tables", _tables(folder, results)),
-        ("risks", "Residual risks", _risks(found, provenance)),
-        ("provenance", "Provenance", _definitions(provenance)),
+        ("risks", "Residual risks", risks_html(found, provenance)),
+        ("provenance", "Provenance", definitions_html(provenance)),
         ("contest", "Run it again, or contest it", _rerun(provenance)),
     ]
     links = "".join(f'<li><a href="#{key}">{escape(name)}</a></li>' for key, name, _ in sections)
@@ -98,7 +98,7 @@ def write_index(
     return path
 
 
-def _verdict(found: Mapping[str, Result]) -> str:
+def verdict_html(found: Mapping[str, Result]) -> str:
     """The gates of the configuration in force, in one sentence and a table."""
     name, figures = _judged(found)
     if figures is None:
@@ -141,7 +141,8 @@ def _judged(found: Mapping[str, Result]) -> tuple[str, Mapping[str, Any] | None]
     return name, configurations.get(name)
 
 
-def _tested(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+def tested_html(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+    """What went through the simulation, and what did not."""
     data = found["compare"].data if "compare" in found else {}
     count = data.get("scenarios", provenance.get("scenarios", "a set of"))
     camera = data.get("camera", {})
@@ -196,7 +197,7 @@ def _tables(folder: Path, results: Iterable[Result]) -> str:
                 None,
             )
             link = f' <a href="{_href(folder, file)}">CSV</a>' if file is not None else ""
-            parts.append(_table(table, link))
+            parts.append(table_html(table, link))
     return "".join(parts) or "<p>No tables.</p>\n"
 
 
@@ -206,7 +207,8 @@ def _places(folder: Path, name: str) -> list[Path]:
     return [folder / file, folder / "tables" / file]
 
 
-def _table(table: Table, link: str = "") -> str:
+def table_html(table: Table, link: str = "") -> str:
+    """A table with its caption and note; `link` is HTML behind the caption."""
     columns = [[row[i] for row in table.rows] for i in range(len(table.columns))]
     texts = [_column(cells) for cells in columns]
     mark = [
@@ -227,7 +229,8 @@ def _table(table: Table, link: str = "") -> str:
     )
 
 
-def _risks(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+def risks_html(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+    """The residual-risk register of what was measured."""
     _, figures = _judged(found)
     by_scenario = (figures or {}).get("by_scenario", {})
     register = from_figures(by_scenario, {}, provenance.get("suite_hash", ""))
@@ -236,12 +239,12 @@ def _risks(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
         "<p>What the system does not or only partly answer. Field-blocking: more evidence is "
         "needed before it runs unsupervised; monitor: collect data in the field.</p>\n"
     )
-    parts = [intro, _table(hazards)]
+    parts = [intro, table_html(hazards)]
     if by_scenario:
         # The hazard classes are in the scenario files, which this page does not have.
         columns = [i for i, c in enumerate(scenarios.columns) if c != "Hazard"]
         parts.append(
-            _table(
+            table_html(
                 Table(
                     scenarios.name,
                     scenarios.title,
@@ -254,7 +257,8 @@ def _risks(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
     return "".join(parts)
 
 
-def _definitions(items: Mapping[str, str]) -> str:
+def definitions_html(items: Mapping[str, str]) -> str:
+    """Names and values, e.g. hashes."""
     rows = "".join(
         f"<dt>{escape(str(k).replace('_', ' '))}</dt><dd><code>{escape(str(v))}</code></dd>"
         for k, v in items.items()

@@ -47,7 +47,7 @@ function fitted(play, width, height) {
   for (const agent of play.agents) for (const [, x, y] of agent.path) { xs.push(x); ys.push(y); }
   for (const camera of play.cameras) { xs.push(camera.x); ys.push(camera.y); }
   const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
-  const scale = Math.min((width - 50) / Math.max(x1 - x0, 12), (height - 50) / Math.max(y1 - y0, 12), 40);
+  const scale = Math.min(Math.max(width - 50, 10) / Math.max(x1 - x0, 12), Math.max(height - 50, 10) / Math.max(y1 - y0, 12), 40);
   return { x: (x0 + x1) / 2, y: (y0 + y1) / 2, scale };
 }
 

@@ -1,8 +1,8 @@
 // A playback on the page: the moment, its sentence, the pictures, the keys. The report uses it too.
 
-import { $, calm, el, percent, seconds, setText, stateIcon, STATES } from "/static/ui.js";
+import { $, el, percent, seconds, setText, stateIcon, STATES } from "/static/ui.js";
 import { planWords } from "/static/testbench-plan.js";
-import { heightFor, spans, timeline } from "/static/testbench-timeline.js";
+import { spans, timeline } from "/static/testbench-timeline.js";
 import { NAMES, TIERS, chosenPair, configurationName, headline, judgement, spoken, stateAt } from "/static/testbench-words.js";
 
 const LEGEND = [["pedestrian", "pedestrian"], ["cyclist", "cyclist"], ["vehicle", "vehicle"], ["ring", "where the camera puts them"], ["pair", "the pair that decides"], ["seen", "ground the camera sees"]];
@@ -115,7 +115,6 @@ export function player(options) {
       setText($("#table-note"), `${play.scenario.name}: every moment at which a state or the danger changes.`);
       paint();
     },
-    height: heightFor,
   };
 }
 
@@ -158,5 +157,3 @@ function changesTable(host, play) {
       return el("tr", {}, el("th", { scope: "row" }, `${(f / play.fps).toFixed(2)} s`), play.sides.map((side) => el("td", {}, STATES[NAMES[side.state[f]]].word)), el("td", {}, { none: "–", actionable: "yes, a warning helps", imminent: "yes, too late" }[TIERS[play.truth.tier[f]]]), el("td", { class: "number" }, pair ? pair.distance.toFixed(2) : "–"), el("td", {}, play.sides[0].sentence[f]));
     })));
 }
-
-export const still = calm;

@@ -1,6 +1,6 @@
 // The test bench: asks the box for runs of the deployed rule and shows them. It computes no verdict.
 
-import { $, announce, el, percent, request, seconds, setText, stateIcon, toast } from "/static/ui.js";
+import { $, announce, el, request, setText, toast } from "/static/ui.js";
 import { controls, set } from "/static/testbench-controls.js";
 import { editor } from "/static/testbench-editor.js";
 import { flow } from "/static/testbench-flow.js";
@@ -253,4 +253,3 @@ async function start() {
 }
 
 start().catch((error) => { setText($("#headline"), `The bench did not start: ${error.message}`); });
-export { app, percent, seconds, stateIcon };

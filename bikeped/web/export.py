@@ -1,0 +1,200 @@
+"""One self-contained page: every scenario's playback, figures, gates and residual risks.
+
+It needs no network and no server: style sheets, scripts and data are inside, and its own content
+security policy lets it load nothing else. The pictures are drawn by the very modules of the test
+bench; gates, tables and risks are plain HTML and are there without scripts, too, to be printed.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from bikeped import __version__
+from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
+from bikeped.conformance.experiments import compare_table, run_table
+from bikeped.conformance.report import (
+    definitions_html,
+    risks_html,
+    table_html,
+    tested_html,
+    verdict_html,
+)
+from bikeped.conformance.scenario import Scenario
+from bikeped.conformance.tables import Result
+from bikeped.web.testbench import configurations
+from bikeped.web.testbench_contest import runs
+from bikeped.web.testbench_playback import coverage, playback
+from bikeped.web.testbench_run import BenchSuite, Workbench
+from bikeped.web.testbench_settings import in_force
+
+_STATIC = Path(__file__).with_name("static")
+#: In the order in which they need one another.
+_SCRIPTS = (
+    "ui.js",
+    "testbench-words.js",
+    "testbench-timeline.js",
+    "testbench-plan.js",
+    "testbench-flow.js",
+    "testbench-strip.js",
+    "testbench-player.js",
+    "report.js",
+)
+_STYLES = ("app.css", "testbench.css", "report.css")
+#: Positions in the file are rounded to centimetres, as no camera is better.
+_DIGITS = 2
+
+
+def make_report(
+    loaded: LoadedConfig,
+    scenarios: Sequence[Scenario],
+    command: str,
+    tell: Callable[[int], None] = lambda done: None,
+) -> str:
+    """The page of the configuration in force. `command` makes it again; `tell` counts scenarios."""
+    work = Workbench(loaded, scenarios)
+    suite = work.whole(in_force(loaded))
+    named = configurations(loaded)
+    decision = loaded.config.decision
+    found = {
+        "run": run_table(suite, decision),
+        "compare": compare_table(suite, loaded, named),
+    }
+    name = next(n for n, d in named.items() if d == decision)
+    plays = []
+    for index in range(len(suite.scenarios)):
+        plays.append(_play(suite, index, name, named))
+        tell(index + 1)
+    data = {
+        "plays": plays,
+        "cameras": [coverage(suite.camera, pose) for pose in suite.poses],
+        "strips": [_strip(suite, i, play) for i, play in enumerate(plays)],
+        "in_force": name,
+    }
+    return _page(found, data, suite, loaded, command)
+
+
+def _play(
+    suite: BenchSuite, index: int, name: str, named: Mapping[str, DecisionConfig]
+) -> dict[str, Any]:
+    """A playback with all numbers of the configuration in force, and the others' states."""
+    others = {n: d for n, d in named.items() if n != name}
+    play = playback(suite, index, {name: named[name], **others})
+    for side in play["sides"][1:]:
+        for key in ("sentence", "chosen", "pairs", "pedestrians", "since_cyclist_s", "remembered"):
+            del side[key]
+        side["state"] = runs(side["state"])
+    for agent in play["agents"]:
+        for key in ("true", "detected", "heading"):
+            agent[key] = _round(agent[key])
+        agent["missed"] = runs(agent["missed"])
+    play["tracks"]["xy"] = _round(play["tracks"]["xy"])
+    del play["truth"]["severity"]
+    return play
+
+
+def _round(values: list[float | None]) -> list[float | None]:
+    return [None if v is None else round(v, _DIGITS) for v in values]
+
+
+def _strip(suite: BenchSuite, index: int, play: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "name": suite.scenarios[index].name,
+        "hazard": suite.scenarios[index].hazard,
+        "frames": play["frames"],
+        "truth": runs(play["truth"]["tier"]),
+        "before": None,
+        "after": runs(play["sides"][0]["state"]),
+    }
+
+
+def _page(
+    found: Mapping[str, Result],
+    data: Mapping[str, Any],
+    suite: BenchSuite,
+    loaded: LoadedConfig,
+    command: str,
+) -> str:
+    provenance = {
+        "version": __version__,
+        "deciding_code": code_hash(DECIDING_CODE),
+        "measuring_code": code_hash(MEASURING_CODE),
+        "suite_hash": suite.hash,
+        "config_hash": loaded.hash,
+        "calibration_hash": str(loaded.calibration_hash),
+        "command": command,
+    }
+    tables = "".join(table_html(t) for result in found.values() for t in result.tables)
+    parts = {
+        "verdict": verdict_html(found),
+        "tested": tested_html(found, provenance),
+        "tables": tables,
+        "risks": risks_html(found, provenance),
+        "provenance": definitions_html(provenance),
+        "command": escape(command),
+        "decision": escape(json.dumps(msgspec.to_builtins(loaded.config.decision))),
+    }
+    body = _filled((_STATIC / "report.html").read_text(encoding="utf-8"), parts)
+    style = "\n".join((_STATIC / name).read_text(encoding="utf-8") for name in _STYLES)
+    theme = (_STATIC / "theme.js").read_text(encoding="utf-8")
+    script = bundle({name: (_STATIC / name).read_text(encoding="utf-8") for name in _SCRIPTS})
+    policy = (
+        "default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; "
+        f"style-src {_hash(style)}; script-src {_hash(theme)} {_hash(script)}"
+    )
+    # Inside a script element only "<" can end it: as \\u003c it is the same JSON.
+    told = msgspec.json.encode(data).decode().replace("<", "\\u003c")
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        '<meta name="referrer" content="no-referrer">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>Does the crossing warn in time? bikeped {__version__}</title>\n"
+        f"<style>{style}</style>\n<script>{theme}</script>\n</head>\n<body>\n{body}\n"
+        f'<script type="application/json" id="data">{told}</script>\n'
+        f"<script>{script}</script>\n</body>\n</html>\n"
+    )
+
+
+def _filled(text: str, parts: Mapping[str, str]) -> str:
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text)
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+_IMPORT = re.compile(r'^import (\{[^}]*\}) from "/static/([\w.-]+)";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export ((?:async )?(?:const|let|function|class)) ([\w$]+)", re.MULTILINE)
+
+
+def bundle(modules: Mapping[str, str]) -> str:
+    """Modules as one plain script, for a page from the disk may not import files.
+
+    Each becomes a function that gives what it exports; `modules` by name, in the order of need.
+    Knows `import {a, b} from "/static/x.js";` and `export const|let|function|class name`.
+    """
+    parts = ['"use strict";', "const modules = {};"]
+    for name, text in modules.items():
+        exported = [found[2] for found in _EXPORT.finditer(text)]
+        text = _IMPORT.sub(lambda found: f'const {found[1]} = modules["{found[2]}"];', text)
+        text = _EXPORT.sub(lambda found: f"{found[1]} {found[2]}", text)
+        if re.search(r"^(?:import|export)\b", text, re.MULTILINE) or "</" in text:
+            raise ValueError(
+                f"{name}: holds an import, export or closing tag that cannot be inlined"
+            )
+        parts.append(
+            f'modules["{name}"] = (() => {{\n{text}\nreturn {{ {", ".join(exported)} }};\n}})();'
+        )
+    return "\n".join(parts)
