@@ -25,6 +25,7 @@ from bikeped.calibration.model import (
     residuals,
 )
 from bikeped.calibration.normal import Normal, moved, normal_equations
+from bikeped.calibration.threads import one_thread
 from bikeped.geometry.lens import curve
 from bikeped.types import BoolArray, FloatArray
 
@@ -68,6 +69,7 @@ def noise_px(error: FloatArray, seen: BoolArray) -> float:
     return max(float(np.median(distance)) / MEDIAN_OF_NOISE, _FLOOR_PX)
 
 
+@one_thread
 def adjust(sightings: Sightings, model: Model, start: State, *, robust: bool = True) -> Adjusted:
     """Both stages from `start` (whose lens is cut or filled up with zeros to the model's terms).
 

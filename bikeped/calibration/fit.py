@@ -19,6 +19,7 @@ from bikeped.calibration.model import (
     gain,
 )
 from bikeped.calibration.normal import normal_equations
+from bikeped.calibration.threads import one_thread
 from bikeped.calibration.validate import held_out_residuals
 from bikeped.geometry import Lens
 from bikeped.geometry.lens import curve
@@ -109,6 +110,7 @@ class Fit:
         return Lens(self.state.projection, self.focal_px, max_theta_rad, self.state.terms)
 
 
+@one_thread
 def fit(sightings: Sightings, model: Model, start: State, folds: int = 0) -> Fit:
     """Adjusts the model from `start`, its uncertainty, and with `folds` > 1 cross-validates it."""
     adjusted = adjust(sightings, model, start)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from bikeped.calibration.model import Sightings, State, bearings, camera_points, project
+from bikeped.calibration.threads import one_thread
 from bikeped.errors import CalibrationError
 from bikeped.geometry.lens import LIMITS, Projection, curve
 from bikeped.types import FloatArray
@@ -22,6 +23,7 @@ _SCANNED = 10  # pictures that the scan looks at: the choice needs no more
 _REWEIGHTED = 4
 
 
+@one_thread
 def first_guess(sightings: Sightings, projections: tuple[Projection, ...] = FISHEYE) -> State:
     """Lens (no radial terms) and poses; CalibrationError when no guess makes sense of a board.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.calibration.adjust import adjust
+from bikeped.calibration.adjust import Adjusted, adjust
 from bikeped.calibration.board_shape import alignment
 from bikeped.calibration.initial import FISHEYE, first_guess, picture_errors_px
 from bikeped.calibration.model import Model, Sightings, State
@@ -18,6 +18,7 @@ from bikeped.calibration.outliers import (
     useless_pictures,
     wrong_corners,
 )
+from bikeped.calibration.threads import one_thread
 from bikeped.calibration.views import BoardView, Found, Refused
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing
@@ -26,6 +27,8 @@ from bikeped.geometry.lens import inverse_curve
 FEWEST_BOARDS = 3
 #: Boards are alike when none moves by more than this share of its own size.
 _ALIKE_SHARE = 0.1
+#: Corners that are off by more of a square than this make no board.
+_MOST_NOISE_SHARE = 0.1
 #: A fisheye lens sees at least this far from its axis, in the corner of its picture.
 _FISHEYE_FROM_DEG = 55.0
 #: How much better a perspective lens must explain the corners than every fisheye one.
@@ -67,6 +70,7 @@ def cropped(found: Found, framing: Framing) -> Found:
     return replace(found, views=views, refused=refused)
 
 
+@one_thread
 def prepare(found: Found) -> Prepared:
     """Checks the boards, guesses the lens, finds wrong corners, counts all boards one way.
 
@@ -102,6 +106,7 @@ def prepare(found: Found) -> Prepared:
                 f"IMAGES: the corners of {int(useless.sum())} boards contradict one another, and "
                 f"{len(sightings)} are left; check --pattern, and that the board is stiff"
             )
+    _make_boards(fitted, sightings)
     numbering, state = alignment(state, sightings, fitted.sigma_px)
     sightings = sightings.renumbered(numbering)
     _is_fisheye(sightings, state)
@@ -125,6 +130,20 @@ def _enough(views: Sequence[BoardView], found: Found) -> None:
             f"IMAGES: {what} of {size} inner corners in {found.pictures} pictures, and a lens "
             f"needs at least {FEWEST_BOARDS}, better 15, all over the picture; photograph more, or "
             "correct --pattern"
+        )
+
+
+def _make_boards(fitted: Adjusted, sightings: Sightings) -> None:
+    """Corners that lie nowhere near a board, even after the best fit."""
+    grid = sightings.uv_px.reshape(len(sightings), sightings.pattern.rows, -1, 2)
+    seen = sightings.seen.reshape(grid.shape[:3])
+    steps = np.linalg.norm(np.diff(grid, axis=2), axis=-1)[seen[:, :, 1:] & seen[:, :, :-1]]
+    square = float(np.median(steps)) if len(steps) else 0.0
+    if fitted.sigma_px > _MOST_NOISE_SHARE * square:
+        raise CalibrationError(
+            f"IMAGES: the corners make no {sightings.pattern.columns}x{sightings.pattern.rows} "
+            f"boards: off by {fitted.sigma_px:.1f} px where a square has {square:.0f}; check "
+            "--pattern"
         )
 
 

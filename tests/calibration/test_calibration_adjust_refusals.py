@@ -1,0 +1,116 @@
+"""Sets of boards that cannot give a lens: each gets a clear word."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_scenes import PATTERN, boards, camera, found
+
+from bikeped.calibration.compare import calibrate
+from bikeped.calibration.model import Model
+from bikeped.calibration.prepare import cropped, prepare
+from bikeped.calibration.synthetic import (
+    BoardPose,
+    DrawnCamera,
+    draw_views,
+    spread_poses,
+    turn,
+)
+from bikeped.calibration.views import BoardView, Refused
+from bikeped.errors import CalibrationError
+from bikeped.geometry import Framing, Lens
+
+
+def refusal(views: list[BoardView], refused: tuple[Refused, ...] = ()) -> str:
+    with pytest.raises(CalibrationError) as caught:
+        prepare(found(views, refused))
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_no_board() -> None:
+    text = refusal([], (Refused("a.jpg", "no board"), Refused("b.jpg", "no board")))
+    assert "no board of 8x6" in text
+    assert "in 2 pictures" in text
+    assert "--pattern" in text
+
+
+@pytest.mark.parametrize(("count", "what"), [(1, "one board"), (2, "2 boards")])
+def test_too_few_boards(count: int, what: str) -> None:
+    assert what in refusal(boards(camera(size=1000), count))
+
+
+def test_boards_that_all_stand_alike() -> None:
+    drawn = camera(size=1000)
+    pose = spread_poses(drawn, PATTERN, 3, seed=1)[1]
+    views = draw_views(drawn, PATTERN, [pose] * 6, noise_px=0.3, seed=3)
+    assert "stand alike" in refusal(views)
+
+
+def test_boards_that_face_the_lens_leave_its_focal_length_open() -> None:
+    drawn = camera(size=1000)
+    poses = [
+        BoardPose(turn([0, 0, 0.5 * n]), np.array([0.02 * n, -0.03 * n, 3.0 + 0.3 * n]))
+        for n in range(6)
+    ]
+    views = draw_views(drawn, PATTERN, poses, noise_px=0.3, seed=3)
+    prepared = prepare(found(views))
+    with pytest.raises(CalibrationError, match="focal length open"):
+        calibrate(prepared, [Model("equidistant", 2)], 3)
+
+
+@pytest.mark.parametrize("half_deg", [25.0, 40.0])
+def test_an_ordinary_lens(half_deg: float) -> None:
+    lens = Lens("perspective", 500 / math.tan(math.radians(half_deg)), math.radians(half_deg))
+    drawn = DrawnCamera(lens, 499.5, 499.5, 1000, 1000)
+    poses = spread_poses(drawn, PATTERN, 12, seed=1, span_deg=(15, 25))
+    views = draw_views(drawn, PATTERN, poses, noise_px=0.2, seed=3)
+    assert "not a fisheye" in refusal(views)
+
+
+@pytest.mark.parametrize("projection", ["equidistant", "stereographic"])
+def test_a_narrow_fisheye_is_still_one(projection: str) -> None:
+    drawn = camera(projection, 70.0, size=1000)  # type: ignore[arg-type]
+    views = boards(drawn, 12, span_deg=(20.0, 35.0), noise_px=0.2)
+    assert len(prepare(found(views)).sightings) == 12
+
+
+def test_a_board_that_contradicts_the_others_is_named() -> None:
+    views = boards(camera(size=1000), 12)
+    rng = np.random.default_rng(4)
+    views[5] = replace(views[5], uv_px=rng.permutation(views[5].uv_px))
+    prepared = prepare(found(views))
+    assert [r.name for r in prepared.refused] == [views[5].name]
+    assert "do not fit the other boards" in prepared.refused[0].why
+    assert len(prepared.sightings) == 11
+
+
+def test_corners_that_are_nothing_but_noise() -> None:
+    rng = np.random.default_rng(4)
+    views = [
+        BoardView(f"{n}", np.arange(48), rng.uniform(0, 1000, (48, 2)), 1000, 1000)
+        for n in range(6)
+    ]
+    refusal(views)
+
+
+def test_sensor_frames_are_calibrated_in_the_crop() -> None:
+    framing = Framing(3840, 2160, 3840, 3500)
+    uv = np.array([[170.0 + n, 500.0] for n in range(12)] + [[100.0, 9.0]] * 3)
+    view = BoardView("a", np.arange(15), uv, 3840, 2160)
+    lost = BoardView("b", np.arange(15), uv * 0 + 20, 3840, 2160)
+    out = cropped(found([view, lost]), framing)
+    assert [v.name for v in out.views] == ["a"]
+    assert (out.views[0].width, out.views[0].height) == (3500, 3500)
+    np.testing.assert_allclose(out.views[0].uv_px[0], [0.0, 500 + 670])
+    assert len(out.views[0]) == 12  # what lies outside the crop is not used
+    assert [r.name for r in out.refused] == ["b"]
+
+
+def test_pictures_of_another_size_are_taken_as_they_are() -> None:
+    views = boards(camera(size=1000), 3)
+    assert cropped(found(views), Framing(3840, 2160, 3840, 3500)).views == views
