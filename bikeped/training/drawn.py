@@ -39,7 +39,7 @@ class DrawnSettings:
     seed: int = 1
     part: int = 20  #: pictures that share a camera
     configured: float = 0.6  #: share of parts seen by the configured camera
-    large: float = 0.2  #: share of parts drawn at 1920 x 1080, the others at 960 x 540
+    large: float = 0.5  #: share of parts drawn at 1920 x 1080, the others at 960 x 540
     lens: str = "fisheye"  #: of the other cameras: fisheye or rectilinear
     processes: int = 2
 

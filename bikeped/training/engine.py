@@ -98,7 +98,7 @@ def onnx_facts(model: Path) -> dict[str, str]:
     except Exception as error:  # its errors share no class but this one
         reason = " ".join(str(error).split())[:200]
         raise DetectorError(f"{model}: is no ONNX model that can be loaded ({reason})") from error
-    return dict(session.get_modelmeta().custom_metadata_map)
+    return dict(sorted(session.get_modelmeta().custom_metadata_map.items()))
 
 
 def _tensorrt(out: Path) -> Any:

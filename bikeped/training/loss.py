@@ -90,7 +90,8 @@ def detection_loss(
         quality = torch.cat(qualities)
         parts["overlap"] = _OVERLAP_GAIN * (torch.cat(overlaps) * quality).sum() / many
         parts["edge"] = _EDGE_GAIN * (torch.cat(edges) * quality).sum() / many
-    total: Any = sum(parts.values())
+    # Also of a batch with nobody in it, every weight has a gradient: nought.
+    total: Any = sum(parts.values()) + 0.0 * edge.float().sum()
     return total, {name: float(part.detach()) for name, part in parts.items()}
 
 
@@ -131,7 +132,7 @@ def pair_overlap(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def generalised_overlap(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Generalised intersection over union [n] of pairs of boxes (Rezatofighi et al. 2019): -1..1."""
+    """Generalised intersection over union [n] of pairs of boxes, -1..1 (Rezatofighi, 2019)."""
     low, high = torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])
     shared = (high - low).clamp(min=0).prod(1)
     union = _area(a) + _area(b) - shared + _TINY
