@@ -23,7 +23,10 @@ _INPUTS = {
     "trace": "--trace",
     "curve_path": "--recall-curve",
     "data": "DATA",
+    "images": "IMAGES",
     "models": "MODEL",
+    "weights": "WEIGHTS",
+    "validation": "--validation",
     "picture": "FRAME",
     "points_path": "--points",
 }
@@ -35,6 +38,9 @@ _OUTPUTS = {
     "out": "--out",
     "figure": "--figure",
     "curve_out": "--curve",
+    "engine": "--engine",
+    "report_path": "--report",
+    "board_path": "--board",
     "grid_path": "--grid",
 }
 
