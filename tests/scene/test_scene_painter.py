@@ -1,0 +1,198 @@
+"""Pictures: the same each time, different where they should be, black outside the circle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from bikeped.config import load_config
+from bikeped.conformance.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenario
+from bikeped.errors import GeometryError, ScenarioError
+from bikeped.geometry import Lens
+from bikeped.scene import (
+    LIGHTS,
+    Conditions,
+    SceneCamera,
+    ScenePainter,
+    lens_camera,
+    random_camera,
+    random_conditions,
+    random_scenario,
+    rectilinear_camera,
+    scene_camera,
+)
+from bikeped.scene.backdrop import backdrop
+from bikeped.scene.camera import rays
+from bikeped.types import ImageArray
+
+SIZE = (320, 180)
+
+
+@pytest.fixture(scope="module")
+def view() -> SceneCamera:
+    return scene_camera(load_config(None, ()), SIZE)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return load_scenario(bundled_folder() / "multiple-vrus.yaml")
+
+
+def test_same_arguments_give_the_same_bytes(view: SceneCamera, scenario: Scenario) -> None:
+    conditions = Conditions(seed=4, weather="rain", place=3)
+    first = ScenePainter(scenario, view, conditions)
+    wanted = [first.draw(t) for t in (5.0, 5.1)]
+    backdrop.cache_clear()
+    rays.cache_clear()
+    again = ScenePainter(scenario, view, conditions)
+    # In another order: a picture must not depend on the one before.
+    for t, (image, objects) in reversed(list(zip((5.0, 5.1), wanted, strict=True))):
+        assert again.objects(t) == objects
+        assert (again.frame(t) == image).all()
+    assert (wanted[0][0] != wanted[1][0]).any()
+
+
+def test_a_picture_is_the_callers_own(view: SceneCamera, scenario: Scenario) -> None:
+    painter = ScenePainter(scenario, view)
+    image, objects = painter.draw(4.0)
+    kept = image.copy()
+    image[:] = 0
+    objects.clear()
+    assert (painter.frame(4.0) == kept).all()
+    assert painter.objects(4.0)
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_who_is_there_shows_in_every_light(
+    view: SceneCamera, scenario: Scenario, light: str
+) -> None:
+    conditions = Conditions(light=light, noise=0.0)
+    with_all = ScenePainter(scenario, view, conditions)
+    nobody = Scenario("empty", "safe", "idle", "bicycle", (_far_away(),))
+    street = ScenePainter(nobody, view, conditions).frame(5.0).astype(int)
+    image, objects = with_all.draw(5.0)
+    inside_any = np.zeros(SIZE[::-1], bool)
+    for item in objects:
+        if item.id < 0 or item.visible < 0.5:
+            continue
+        u1, v1, u2, v2 = (round(v) for v in item.box_px)
+        inside_any[v1:v2, u1:u2] = True
+        change = np.abs(image[v1:v2, u1:u2].astype(int) - street[v1:v2, u1:u2]).max(axis=2)
+        assert (change > 6).mean() > 0.2, item
+    # Light from lamps and shadows reaches beyond the boxes, but not everywhere.
+    changed = (np.abs(image.astype(int) - street).max(axis=2) > 6) & ~inside_any
+    assert changed.mean() < 0.12
+
+
+def _far_away() -> Agent:
+    return Agent(
+        1, "pedestrian", np.array([[0.0, 5, -90], [20.0, 5.1, -90]]), SIZES_M["pedestrian"]
+    )
+
+
+def _mean(image: ImageArray) -> float:
+    return float(image.mean())
+
+
+def test_lights_differ_as_they_should(view: SceneCamera, scenario: Scenario) -> None:
+    shots = {
+        light: _mean(ScenePainter(scenario, view, Conditions(light=light)).frame(3.0))
+        for light in LIGHTS
+    }
+    assert shots["night"] < shots["dusk"] < shots["day"]
+    assert shots["glare"] > shots["overcast"] > shots["night"]
+
+
+def test_it_is_black_outside_the_circle(view: SceneCamera, scenario: Scenario) -> None:
+    image = ScenePainter(scenario, view, Conditions(light="glare", noise=5)).frame(1.0)
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
+    crop = view.framing.frame_to_crop(np.stack([u, v], axis=-1))
+    reach = np.hypot(crop[..., 0] - view.camera.cx, crop[..., 1] - view.camera.cy)
+    outside = reach > view.camera.lens.max_radius_px + view.framing.scale
+    assert outside.any()
+    assert image[outside].max() == 0
+    assert np.median(image[~outside].max(axis=1)) > 40
+
+
+def test_rays_are_the_cameras(view: SceneCamera) -> None:
+    found = rays(view)
+    for u, v in ((160, 90), (60, 120), (250, 170), (161, 30)):
+        crop = view.framing.frame_to_crop(np.array([[u + 0.5, v + 0.5]]))
+        ground = view.camera.rays(crop)[0]
+        level = view.pose.ground_to_world(ground[:2]) - (view.pose.x_m, view.pose.y_m)
+        # 4 picture pixels are 48 of the sensor's here: the coarsest that is in use.
+        assert found.world[v, u] == pytest.approx([*level, ground[2]], abs=6e-4)
+
+
+def test_straight_lines_stay_straight_only_in_an_ordinary_lens() -> None:
+    line = np.stack([np.linspace(-3, 13, 9), np.full(9, -9.0), np.zeros(9)], axis=1)
+
+    def bend(camera: SceneCamera) -> float:
+        pixels = camera.pixels(line)
+        pixels = pixels[np.isfinite(pixels).all(axis=1)]
+        way = pixels[-1] - pixels[0]
+        away = pixels - pixels[0]
+        return float(np.abs(away[:, 0] * way[1] - away[:, 1] * way[0]).max() / np.hypot(*way))
+
+    assert bend(rectilinear_camera(90, (640, 360))) < 1e-6
+    fisheye = lens_camera(Lens.from_circle("equidistant", 320, 190), (640, 360), pitch_deg=-15)
+    assert bend(fisheye) > 5
+
+
+def test_an_ordinary_camera_fills_its_picture(scenario: Scenario) -> None:
+    view = rectilinear_camera(90, SIZE)
+    corner = view.camera.rays(np.array([[0.0, 90.0], [320.0, 90.0]]))
+    angle = math.degrees(math.acos(float(corner[0] @ corner[1])))
+    assert angle == pytest.approx(90, abs=0.01)
+    image, objects = ScenePainter(scenario, view).draw(5.0)
+    assert (image.max(axis=2) > 0).mean() > 0.99
+    assert any(item.id > 0 for item in objects)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"light": "dawn"}, {"weather": "snow"}, {"noise": -1.0}, {"noise": 99.0}, {"seed": -1}],
+)
+def test_conditions_say_what_is_wrong(wrong: dict[str, object]) -> None:
+    with pytest.raises(ScenarioError, match=next(iter(wrong))):
+        Conditions(**wrong)  # type: ignore[arg-type]
+
+
+def test_cameras_say_what_is_wrong() -> None:
+    with pytest.raises(GeometryError, match="size"):
+        rectilinear_camera(90, (4, 4))
+    with pytest.raises(GeometryError, match="fov_deg"):
+        rectilinear_camera(179)
+    with pytest.raises(GeometryError, match="lens"):
+        random_camera(1, lens="pinhole")
+    with pytest.raises(GeometryError, match=r"camera\.width"):
+        scene_camera(load_config(None, ()), (640, 640))
+
+
+def test_random_draws_repeat_and_differ() -> None:
+    assert random_conditions(3) == random_conditions(3)
+    assert len({random_conditions(i).place for i in range(20)}) == 20
+    assert {random_conditions(i).light for i in range(60)} == set(LIGHTS)
+    one, same = random_scenario(8), random_scenario(8)
+    for a, b in zip(one.agents, same.agents, strict=True):
+        assert a.kind == b.kind
+        assert (a.path == b.path).all()
+    assert random_camera(5) == random_camera(5)
+    assert random_camera(5) != random_camera(6)
+    kinds = {agent.kind for i in range(80) for agent in random_scenario(i).agents}
+    assert kinds == set(SIZES_M)
+
+
+def test_random_people_stand_near_and_far_and_still() -> None:
+    away, still = [], 0
+    for i in range(120):
+        for agent in random_scenario(i).agents:
+            state = agent.at(3.0)
+            assert state is not None
+            away.append(math.dist(state[0], (5, -13)))
+            still += bool(math.dist(agent.path[0, 1:], agent.path[-1, 1:]) < 0.1)
+    assert min(away) < 2.2
+    assert 30 < max(away) < 41
+    assert 0.1 < still / len(away) < 0.5
