@@ -76,6 +76,9 @@ class BoardBend:
         return np.asarray(pattern.square_m * bend)
 
 
+FLAT = BoardBend()
+
+
 @dataclass(frozen=True)
 class BoardPose:
     """Camera point = `rotation` [3, 3] @ board point + `translation_m` [3]."""
@@ -92,7 +95,7 @@ def true_corners(
     camera: DrawnCamera,
     pattern: BoardPattern,
     pose: BoardPose,
-    bend: BoardBend = BoardBend(),
+    bend: BoardBend = FLAT,
 ) -> tuple[FloatArray, BoolArray]:
     """Where the corners [n, 2] of a board lie in the picture, by id, and which are seen [n].
 
@@ -114,12 +117,13 @@ def spread_poses(
     seed: int = 0,
     span_deg: tuple[float, float] = (25.0, 60.0),
     tilt_deg: float = 35.0,
+    margin_px: float = 0.0,
 ) -> list[BoardPose]:
     """`count` poses that cover the image circle, every corner seen, a third of them at the rim.
 
     `span_deg`: the angle that the board's diagonal takes up; `tilt_deg`: how far its normal leaves
-    the line of sight, at most. A board that would leave the picture is moved toward the axis.
-    GeometryError where no place can be found: the spans are too wide for the lens.
+    the line of sight, at most. A board that would come nearer than `margin_px` to the picture's
+    edge is moved toward the axis. GeometryError where no place is found: the spans are too wide.
     """
     rng = np.random.default_rng(seed)
     poses = []
@@ -136,7 +140,8 @@ def spread_poses(
                 tilt=math.radians(rng.uniform(0.2, 1.0) * tilt_deg),
                 tilt_toward=rng.uniform(-math.pi, math.pi),
             )
-            pose = _outermost(camera, pattern, theta if share < 2 / 3 else half, phi, shape)
+            angle = theta if share < 2 / 3 else half
+            pose = _outermost(camera, pattern, angle, phi, shape, margin_px)
             if pose is not None:
                 poses.append(pose)
                 break
@@ -156,7 +161,7 @@ def draw_views(
     noise_px: float = 0.0,
     outlier_share: float = 0.0,
     outlier_px: float = 20.0,
-    bend: BoardBend = BoardBend(),
+    bend: BoardBend = FLAT,
     seed: int = 0,
 ) -> list[BoardView]:
     """The corners of each pose as the corner finder would hand them over, unseen ones left out.
@@ -188,13 +193,21 @@ class _Shape:
 
 
 def _outermost(
-    camera: DrawnCamera, pattern: BoardPattern, theta: float, phi: float, shape: _Shape
+    camera: DrawnCamera,
+    pattern: BoardPattern,
+    theta: float,
+    phi: float,
+    shape: _Shape,
+    margin_px: float,
 ) -> BoardPose | None:
     """The pose at the largest angle up to `theta` at which the whole board is seen."""
+    far = np.array([camera.width, camera.height]) - 1 - margin_px
 
     def fits(angle: float) -> BoardPose | None:
         pose = _pose_at(pattern, angle, phi, shape)
-        return pose if bool(true_corners(camera, pattern, pose)[1].all()) else None
+        uv, seen = true_corners(camera, pattern, pose)
+        free = (uv >= margin_px).all() and (uv <= far).all()
+        return pose if free and seen.all() else None
 
     best = fits(theta)
     if best is not None:
