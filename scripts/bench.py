@@ -66,7 +66,7 @@ def in_turns(
 
 
 def main() -> int:
-    from benchmarks import conformance, detection, loop, table, tracking
+    from benchmarks import conformance, detection, loop, scene, table, tracking
 
     known: dict[str, Callable[[Figures], None]] = {
         "table": table.run,
@@ -75,6 +75,7 @@ def main() -> int:
         "tracking": tracking.run,
         "loop": loop.run,
         "conformance": conformance.run,
+        "scene": scene.run,
     }
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="BENCHMARK", help=", ".join(known))
