@@ -70,7 +70,7 @@ def drawn_test(
     seen = []
     for jpeg, objects, view in _drawn(loaded, test):
         found = _look(detector, jpeg, view)
-        seen.append(_sights(found, objects, view))
+        seen.append(judge_picture(found, objects, view))
         progress(len(seen))
     return seen
 
@@ -121,6 +121,17 @@ def sweep(seen: Sequence[Sequence[Sight]], confidences: Sequence[float]) -> list
     return rows
 
 
+def choose_confidence(
+    seen: Sequence[Sequence[Sight]], grid: Sequence[float], most_false: float
+) -> float:
+    """The lowest confidence of `grid` with at most `most_false` false pedestrians and cyclists a
+    100 frames; the highest of `grid` where there is none."""
+    for row in sweep(seen, sorted(grid)):
+        if row["false_per_100_frames"] <= most_false:
+            return float(row["confidence"])
+    return float(max(grid))
+
+
 def _numbers(mine: list[Sight], low: float, high: float, confidence: float) -> dict[str, Any]:
     inside = [s for s in mine if low <= s.distance_m < high]
     hits = [s for s in inside if s.found and s.confidence >= confidence]
@@ -161,7 +172,9 @@ def _look(detector: Detector, jpeg: bytes, view: SceneCamera) -> Detections:
     return detector.infer(rgb, width, height).detections
 
 
-def _sights(found: Detections, objects: Sequence[DrawnObject], view: SceneCamera) -> list[Sight]:
+def judge_picture(
+    found: Detections, objects: Sequence[DrawnObject], view: SceneCamera
+) -> list[Sight]:
     """Greedy by confidence, kind for kind, at an overlap of at least `MATCH_IOU`.
 
     A detection on somebody who is hardly visible, tiny or very far, of whatever kind, is neither

@@ -165,3 +165,14 @@ def multiply_adds(network: Any, width: int, height: int) -> int:
     for hook in hooks:
         hook.remove()
     return total
+
+
+def shift_scores(network: SmallNet, score: float, becomes: float) -> None:
+    """Moves every class's score so that what was `score` is `becomes`; their order stays.
+
+    So a network fits a threshold that others were configured for.
+    """
+    odds = [math.log(p / (1 - p)) for p in (score, becomes)]
+    with torch.no_grad():
+        for head in network.heads:
+            head.score.bias += odds[1] - odds[0]

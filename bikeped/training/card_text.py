@@ -1,0 +1,149 @@
+"""The model card for people, from the card's numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bikeped.types import Kind
+
+_HEAD = """# The small detector that comes with bikeped
+
+A network of {weights:,} weights ({megabytes:.2f} MB) that finds pedestrians, cyclists (bicycle and
+rider in one box) and vehicles in **drawn** fisheye pictures. `detection.model: bundled` names it.
+
+## For what, and not for what
+
+It is for the demo, for the self-test of an installation (does the chain run, how fast) and for
+pixel conformance, where the chain from pixels to decision is held against a known world.
+
+**It must not be used for a street.** It has never seen a photograph. What it makes of a real
+picture is unknown, and nobody may be warned, or not warned, by it. `bikeped run` and `bikeped
+doctor` say so where it is configured.
+
+## What it was trained on
+
+{pictures} pictures drawn by `bikeped.scene` ({objects} objects), and nothing else: no photograph,
+no other network's weights. Six tenths were seen by the configured camera from varied spots, the
+others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 to 5.5 m high).
+
+| | |
+| --- | --- |
+| command | `{command}` |
+| sources | bikeped {bikeped}, commit {commit} |
+| seeds | pictures {seed_data}, training {seed}; validation and tests from seeds of their own |
+| drawing | {drawing_min:.0f} min |
+| training | {steps} steps of {windows} windows of 480 x 288 pixels, {training_min:.0f} min |
+| machine | {machine}; PyTorch {torch} on the CPU, two threads{beside} |
+
+The input is 960 x 544 pixels, RGB / 255, the picture centred on grey 114; the output is laid out as
+`yolov8`. Scores are shifted so that the default `detection.confidence` of {confidence} is the one
+chosen on the validation pictures (where at most {most_false} false pedestrians or cyclists a 100
+frames were left); a score is no probability.
+
+## What it is worth
+
+Measured through `bikeped.detection` at `detection.confidence` {confidence}, on pictures drawn at
+1920 x 1080 from seeds, places and lights that neither training nor the choice of the confidence
+saw, JPEG-encoded as a camera's. An object counts where at least 30 % of it shows and its box is 5
+pixels wide at 960 across; it is found where a box of its kind overlaps it by half. The error is
+that of the box's bottom centre on the ground against the object's true middle: the near face of
+what has a depth is always nearer than its middle.
+"""
+
+_ROUND = "| {ring} | {objects} | {recall} | {median} | {p90} |"
+
+
+def card_text(card: Mapping[str, Any]) -> str:
+    """Markdown; `card` is what `scripts/train-detector` writes as JSON beside it."""
+    model, made = card["model"], card["made"]
+    training, test = made["training"], card["configured_camera"]
+    settings = training["settings"]
+    text = _HEAD.format(
+        weights=model["weights"],
+        megabytes=model["bytes"] / 1e6,
+        pictures=training["pictures"],
+        objects=training["objects"],
+        command=made["command"],
+        bikeped=made["bikeped"],
+        commit=made["commit"],
+        seed_data=made["seed_data"],
+        seed=settings["seed"],
+        drawing_min=made["drawing"]["seconds"] / 60,
+        training_min=training["seconds"] / 60,
+        steps=settings["steps"],
+        windows=settings["pictures"] * settings["windows"],
+        machine=made["machine"],
+        torch=training["torch"],
+        beside=made.get("beside", ""),
+        confidence=test["confidence"],
+        most_false=made["most_false"],
+    )
+    for title, key in (
+        ("Through the configured camera", "configured_camera"),
+        ("Through other fisheye lenses, heights and pitches", "other_lenses"),
+    ):
+        text += "\n" + _measured(title, card[key])
+    if "experiment" in card:
+        text += "\n" + _experiment(card["experiment"])
+    return text
+
+
+def _measured(title: str, test: Mapping[str, Any]) -> str:
+    false = test["false_pedestrian_or_cyclist_per_100_frames"]
+    cars = test["kinds"]["vehicle"]["false_per_100_frames"]
+    said = f"{test['frames']} frames from seed {test['seed']}; {false:g} false pedestrians or "
+    said += f"cyclists a 100 frames, {cars:g} false vehicles."
+    lines = [f"### {title}", "", said]
+    for kind in Kind:
+        numbers = test["kinds"][kind.label]
+        lines += [
+            "",
+            f"**{kind.label}**",
+            "",
+            "| distance | objects | recall | median error | 90 % below |",
+            "| --- | ---: | ---: | ---: | ---: |",
+            _row("within 15 m", numbers["within_15_m"]),
+            *(_row(f"{r['from_m']:g} to {r['to_m']:g} m", r) for r in numbers["rings"]),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _row(ring: str, numbers: Mapping[str, Any]) -> str:
+    def shown(value: float | None, form: str) -> str:
+        return "-" if value is None else form.format(value)
+
+    return _ROUND.format(
+        ring=ring,
+        objects=numbers["objects"],
+        recall=shown(numbers["recall"], "{:.1%}"),
+        median=shown(numbers["median_error_m"], "{:.2f} m"),
+        p90=shown(numbers["p90_error_m"], "{:.2f} m"),
+    )
+
+
+def _experiment(experiment: Mapping[str, Any]) -> str:
+    """The paper's effect in miniature."""
+    said = f"The same network, from scratch, {experiment['steps']} steps each on "
+    said += f"{experiment['pictures']} rectilinear drawings, and on those drawings warped by "
+    said += "`bikeped model augment`; both measured on held-out drawn fisheye pictures "
+    said += "(`scripts/train-detector --experiment`)."
+    lines = [
+        "## Trained on ordinary pictures, and on the same pictures made fisheye",
+        "",
+        said,
+        "",
+        "| road users | trained on ordinary | on augmented | factor |",
+        "| --- | ---: | ---: | ---: |",
+    ]
+    pairs = [(experiment[name]["road_users"]) for name in ("ordinary", "augmented")]
+    rows = [("all", pairs[0]["all"], pairs[1]["all"])]
+    rows += [(a["name"], a, b) for a, b in zip(pairs[0]["rows"], pairs[1]["rows"], strict=True)]
+    for name, a, b in rows:
+        factor = "-" if not a["ap"] or b["ap"] is None else f"{b['ap'] / a['ap']:.2f}"
+        lines.append(f"| {name}, AP@50:95 | {_three(a['ap'])} | {_three(b['ap'])} | {factor} |")
+    return "\n".join(lines) + "\n"
+
+
+def _three(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

@@ -1,0 +1,221 @@
+"""Our own small detector from nothing: draws streets, trains, measures, writes the card.
+
+    scripts/train-detector --out DIR              all of it, under an hour on two cores
+    scripts/train-detector --out DIR --ship       and puts model and card into the package
+    scripts/train-detector --out DIR --experiment rectilinear against fisheye-augmented training
+
+A step whose result is in DIR already is passed over; remove it to do it again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from bikeped import __version__
+from bikeped.config import load_config
+from bikeped.config.sections import DetectionConfig
+from bikeped.detection.hashing import sha256_of
+from bikeped.files import make_folder, write_whole
+from bikeped.models import BUNDLED_FILE
+from bikeped.training.augment import AugmentSettings, augment_data
+from bikeped.training.card import DrawnTest, choose_confidence, drawn_test, summary, sweep
+from bikeped.training.card_text import card_text
+from bikeped.training.coco import read_coco
+from bikeped.training.crops import CropSettings
+from bikeped.training.drawn import DrawnSettings, draw_set
+from bikeped.training.export import export_network
+from bikeped.training.fit import FitSettings, fit, load_weights
+from bikeped.training.network import multiply_adds, shift_scores
+from bikeped.training.small import SmallOrder, train_small
+from bikeped.training.warp import WarpRanges
+
+PICTURES, STEPS = 4000, 6000
+TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
+VALIDATION = DrawnTest(pictures=400, seed=8_000_001)
+TEST = DrawnTest(pictures=600, seed=9_000_001)
+OTHER_LENSES = replace(TEST, pictures=300, seed=9_500_001, own_lens=True)
+#: The shipped confidence is where validation has this many false ones a 100 frames, with room left.
+MOST_FALSE = 0.5
+GRID = [round(0.02 * i, 2) for i in range(2, 48)]
+
+#: Of the experiment: both networks get as much of everything.
+EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 800, 1000
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for everything")
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument("--pictures", type=int, default=PICTURES)
+    parser.add_argument("--ship", action="store_true", help="copy model and card into the package")
+    parser.add_argument("--experiment", action="store_true")
+    options = parser.parse_args()
+    out: Path = options.out
+    make_folder(out)
+    if options.experiment:
+        experiment(out)
+        return 0
+    build(out, options.pictures, options.steps)
+    if options.ship:
+        for suffix in (".onnx", ".json", ".md"):
+            shutil.copyfile(out / f"small{suffix}", BUNDLED_FILE.with_suffix(suffix))
+            say(f"wrote {BUNDLED_FILE.with_suffix(suffix)}")
+    return 0
+
+
+def build(out: Path, pictures: int, steps: int) -> None:
+    """Everything up to the card."""
+    loaded = load_config(None)
+    data = out / "data"
+    if not (data / "annotations.json").is_file():
+        began = time.monotonic()
+        draw_set(data, replace(TRAINING, pictures=pictures), loaded, counted("drawn", pictures))
+        write_json(out / "drawing.json", {"seconds": round(time.monotonic() - began, 1)})
+    training = out / "training"
+    if not (training / "training.json").is_file():
+        make_folder(training)
+        order = SmallOrder(steps=steps, device="cpu")
+        write_json(
+            training / "training.json", train_small(read_coco(data), training, order, say=say)
+        )
+    # The score that becomes the default configuration's confidence.
+    plain = DetectionConfig(model=str((training / "model.onnx").resolve()), confidence=0.04)
+    validation = drawn_test(plain, loaded, VALIDATION, counted("validated", VALIDATION.pictures))
+    chosen = choose_confidence(validation, GRID, MOST_FALSE)
+    shipped = loaded.config.detection.confidence
+    network, names, size, facts = load_weights(training / "weights.pt")
+    shift_scores(network, chosen, shipped)
+    exported = export_network(network, names, size, out / "small.onnx", facts)
+    model = msgspec.structs.replace(
+        loaded.config.detection, model=str((out / "small.onnx").resolve())
+    )
+    card: dict[str, Any] = {
+        "model": {
+            "file": "small.onnx",
+            "sha256": sha256_of(out / "small.onnx"),
+            "bytes": exported.bytes,
+            "classes": list(names),
+            "input": list(size),
+            "weights": sum(p.numel() for p in network.parameters()),
+            "multiply_adds": multiply_adds(network, *size),
+            "score_shift": {"from": chosen, "to": shipped},
+        },
+        "made": {
+            "command": "scripts/train-detector --out DIR --ship",
+            "bikeped": __version__,
+            "commit": commit(),
+            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+            "seed_data": TRAINING.seed,
+            "most_false": MOST_FALSE,
+            "drawing": read(out / "drawing.json"),
+            "training": read(training / "training.json"),
+        },
+        "validation": sweep(validation, [g for g in GRID if g >= plain.confidence]),
+    }
+    for name, test in (("configured_camera", TEST), ("other_lenses", OTHER_LENSES)):
+        seen = drawn_test(model, loaded, test, counted(f"tested, {name}", test.pictures))
+        card[name] = {"seed": test.seed, **summary(seen, shipped)}
+    if (out / "experiment.json").is_file():
+        card["experiment"] = read(out / "experiment.json")
+    write_json(out / "small.json", card)
+    write_whole(out / "small.md", card_text(card))
+    say(f"wrote {out / 'small.onnx'}, small.json, small.md")
+
+
+def experiment(out: Path) -> None:
+    """The same network, steps and seeds on ordinary pictures and on fisheye-augmented ones."""
+    loaded = load_config(None)
+    folder = out / "experiment"
+    make_folder(folder)
+    ordinary = DrawnSettings(
+        EXPERIMENT_PICTURES, seed=21, configured=0, large=0, lens="rectilinear"
+    )
+    held_out = DrawnSettings(400, seed=22, configured=0, large=0)
+    for name, settings in (("ordinary", ordinary), ("held-out", held_out)):
+        if not (folder / name / "annotations.json").is_file():
+            draw_set(folder / name, settings, loaded, counted(name, settings.pictures))
+    if not (folder / "augmented" / "annotations.json").is_file():
+        # As wide as the held-out pictures, so that objects keep their size.
+        order = AugmentSettings(WarpRanges(size_px=960), 0, 1, 0.3, 2)
+        source = read_coco(folder / "ordinary")
+        augment_data(source, folder / "augmented", order, counted("augmented", len(source.images)))
+    lines: dict[str, Any] = {"pictures": EXPERIMENT_PICTURES, "steps": EXPERIMENT_STEPS}
+    for name, view in (("ordinary", (960, 544)), ("augmented", (960, 960))):
+        model = folder / f"{name}.onnx"
+        if not model.is_file():
+            order_of_fit = FitSettings(
+                steps=EXPERIMENT_STEPS, warmup=100, memory=0.998, crops=CropSettings(view=view)
+            )
+            fitted = fit(read_coco(folder / name), order_of_fit, say=say)
+            export_network(fitted.network, fitted.names, (960, 544), model, {"experiment": name})
+            write_json(folder / f"{name}.json", {"seconds": round(fitted.seconds, 1)})
+        lines[name] = read(folder / f"{name}.json")
+    report = folder / "evaluation.json"
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "bikeped.cli.main", "model", "evaluate"),
+            *(f"{name}={folder / name}.onnx" for name in ("ordinary", "augmented")),
+            *(str(folder / "held-out"), "--json", str(report)),
+        ],
+        check=True,
+    )
+    for row in read(report)["models"]:
+        lines[row["label"]]["road_users"] = row["road_users"]
+        lines[row["label"]]["merged"] = row["merged"]
+    write_json(out / "experiment.json", lines)
+    say(f"wrote {out / 'experiment.json'}")
+
+
+def say(line: str) -> None:
+    print(line, flush=True)
+
+
+def counted(what: str, total: int) -> Any:
+    """Says how far it is, now and then."""
+    began, last = time.monotonic(), [0.0]
+
+    def progress(done: int) -> None:
+        now = time.monotonic()
+        if now - last[0] > 20 or done == total:
+            last[0] = now
+            say(f"{what}: {done} of {total}, {now - began:.0f} s")
+
+    return progress
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def write_json(path: Path, data: Any) -> None:
+    write_whole(path, json.dumps(data, indent=1) + "\n")
+
+
+def commit() -> str:
+    """The sources' commit, with a plus where they were changed."""
+    try:
+        run = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return run.stdout.strip()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""The card's numbers, from sights whose answer is known by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from bikeped.config import load_config
+from bikeped.config.sections import DetectionConfig
+from bikeped.models import BUNDLED_FILE
+from bikeped.scene import DrawnObject, scene_camera
+from bikeped.training.card import (
+    DrawnTest,
+    Sight,
+    choose_confidence,
+    drawn_test,
+    judge_picture,
+    summary,
+    sweep,
+)
+from bikeped.types import Detections, Kind
+
+NAN = math.nan
+PED, CYC = Kind.PEDESTRIAN, Kind.CYCLIST
+
+
+@pytest.fixture(scope="module")
+def view():
+    return scene_camera(load_config(None), (960, 540))
+
+
+def thing(box, kind=PED, visible=1.0, xy=(8.0, 0.0)):
+    return DrawnObject(1, kind.label, kind, box, box, visible, xy, xy, 0.0)
+
+
+def found(*rows):
+    kind, confidence, box = zip(*rows, strict=True) if rows else ((), (), ())
+    return Detections(
+        np.array(kind, np.int8),
+        np.array(confidence, np.float32),
+        np.array(box, np.float32).reshape(-1, 4),
+    )
+
+
+BOX = (400.0, 300.0, 420.0, 350.0)
+
+
+def test_somebody_found_and_how_far_off_on_the_ground(view):
+    uv, valid = view.camera.project(np.array([[8.0, 1.0, 0.0]]))
+    assert valid.all()
+    u, v = view.framing.crop_to_frame(uv)[0]
+    box = (u - 10, v - 40, u + 10, v)
+    (sight,) = judge_picture(found((PED, 0.7, box)), [thing(box, xy=(8.0, 1.0))], view)
+    assert sight.found
+    assert sight.error_m == pytest.approx(0, abs=1e-3)
+    assert sight.confidence == pytest.approx(0.7)
+    assert sight.distance_m == pytest.approx(math.hypot(8, 1))
+
+
+def test_misses_wrong_kinds_and_doubles(view):
+    (miss,) = judge_picture(found(), [thing(BOX)], view)
+    assert not miss.found
+    rows = judge_picture(found((CYC, 0.9, BOX)), [thing(BOX)], view)
+    assert [(s.kind, s.found) for s in rows] == [(CYC, False), (PED, False)]
+    assert math.isnan(rows[0].distance_m)
+    rows = judge_picture(found((PED, 0.9, BOX), (PED, 0.8, BOX)), [thing(BOX)], view)
+    assert [(s.found, math.isnan(s.distance_m)) for s in rows] == [(False, True), (True, False)]
+
+
+def test_nobody_is_asked_for_who_cannot_be_seen(view):
+    hidden = thing(BOX, visible=0.1)
+    assert judge_picture(found(), [hidden], view) == []
+    assert judge_picture(found((PED, 0.9, BOX)), [hidden], view) == []
+    assert judge_picture(found((CYC, 0.9, BOX)), [hidden], view) == []
+    tiny = thing((400, 300, 403, 310))
+    far = thing(BOX, xy=(40.0, 0.0))
+    assert judge_picture(found(), [tiny, far], view) == []
+
+
+def sights():
+    near = [Sight(PED, 5.0, True, 0.5, 0.1), Sight(PED, 14.0, True, 0.2, 0.3)]
+    far = [Sight(PED, 18.0, False, 0.0, NAN), Sight(CYC, 3.0, True, 0.9, NAN)]
+    return [
+        near,
+        [*far, Sight(CYC, NAN, False, 0.3, NAN), Sight(Kind.VEHICLE, NAN, False, 0.9, NAN)],
+    ]
+
+
+def test_the_summary_counts_at_a_confidence():
+    numbers = summary(sights(), 0.25)
+    walkers = numbers["kinds"]["pedestrian"]
+    assert walkers["within_15_m"] == {
+        "objects": 2,
+        "recall": 0.5,
+        "median_error_m": 0.1,
+        "p90_error_m": 0.1,
+    }
+    assert [ring["objects"] for ring in walkers["rings"]] == [0, 1, 1, 1, 0, 0]
+    assert numbers["kinds"]["cyclist"]["false_per_100_frames"] == 50
+    assert numbers["kinds"]["cyclist"]["within_15_m"]["median_error_m"] is None
+    assert numbers["false_pedestrian_or_cyclist_per_100_frames"] == 50
+    assert summary(sights(), 0.35)["false_pedestrian_or_cyclist_per_100_frames"] == 0
+    assert summary(sights(), 0.1)["kinds"]["pedestrian"]["within_15_m"]["recall"] == 1
+
+
+def test_the_confidence_is_the_lowest_that_keeps_the_promise():
+    grid = [0.1, 0.2, 0.35, 0.5]
+    assert choose_confidence(sights(), grid, 1.0) == 0.35
+    assert choose_confidence(sights(), grid, 60) == 0.1
+    assert choose_confidence(sights(), [0.1], 1.0) == 0.1
+    assert [row["confidence"] for row in sweep(sights(), grid)] == grid
+
+
+@pytest.mark.slow
+def test_the_bundled_model_is_shown_drawn_pictures():
+    model = DetectionConfig(model=str(BUNDLED_FILE))
+    seen = []
+    test = DrawnTest(pictures=6, seed=9_700_001, part=3, processes=2)
+    rows = drawn_test(model, load_config(None), test, seen.append)
+    assert seen == [1, 2, 3, 4, 5, 6]
+    near = [s for row in rows for s in row if s.distance_m < 15 and s.kind != Kind.VEHICLE]
+    assert sum(s.found for s in near) >= 0.7 * len(near) > 0
