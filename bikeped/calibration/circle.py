@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,13 @@ _FEWEST_SECTORS = 12
 _DARK_PX = 4
 
 
-def brightest(grays: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
+def brightest(grays: Iterable[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
     """[h, w] each pixel's brightest value over the pictures: dark only where no light comes."""
-    out = grays[0].copy()
-    for gray in grays[1:]:
-        np.maximum(out, gray, out=out)
+    out: npt.NDArray[np.uint8] | None = None
+    for gray in grays:
+        out = gray.copy() if out is None else np.maximum(out, gray, out=out)
+    if out is None:
+        raise ValueError("brightest: no pictures")
     return out
 
 

@@ -60,14 +60,17 @@ class Recommendation:
 
 
 def models_to_compare(chosen: Model) -> list[Model]:
-    """All projections without and with two radial terms; four, and the board's shape, on one.
+    """All projections without and with two radial terms; four, and the board's shape, on the
+    equidistant and the chosen one.
 
     With four terms all projections are the same lens to a thousandth of a pixel (measured), so that
-    one stands for all.
+    one would stand for all.
     """
     models = [Model(p, terms) for terms in (0, 2) for p in FISHEYE]
-    models += [Model(chosen.projection, 4), *(Model(chosen.projection, t, True) for t in (2, 4))]
-    return models if chosen in models else [*models, chosen]
+    projections: list[Projection] = ["equidistant", chosen.projection]
+    models += [Model(p, 4) for p in projections]
+    models += [Model(p, terms, board=True) for p in projections for terms in (2, 4)]
+    return list(dict.fromkeys([*models, chosen]))
 
 
 def calibrate(

@@ -88,6 +88,28 @@ class Sightings:
         )
 
     @functools.cached_property
+    def square_px(self) -> FloatArray:
+        """[V] the median side of each picture's squares; 0 where no two neighbours were seen."""
+        pattern = self.pattern
+        uv = self.uv_px.reshape(len(self), pattern.rows, pattern.columns, 2)
+        seen = self.seen.reshape(uv.shape[:3])
+        across = np.linalg.norm(np.diff(uv, axis=2), axis=-1).reshape(len(self), -1)
+        down = np.linalg.norm(np.diff(uv, axis=1), axis=-1).reshape(len(self), -1)
+        both = [
+            (seen[:, :, 1:] & seen[:, :, :-1]).reshape(len(self), -1),
+            (seen[:, 1:] & seen[:, :-1]).reshape(len(self), -1),
+        ]
+        steps = np.concatenate([across, down], axis=1)
+        known = np.concatenate(both, axis=1)
+        return np.asarray(
+            [
+                np.median(row[keep]) if keep.any() else 0.0
+                for row, keep in zip(steps, known, strict=True)
+            ],
+            dtype=np.float64,
+        )
+
+    @functools.cached_property
     def flat(self) -> FloatArray:
         """[C, 3] the flat board in squares."""
         return self.pattern.corners_m() / self.pattern.square_m

@@ -16,6 +16,8 @@ from bikeped.types import BoolArray
 #: A corner is wrong beyond this many standard deviations, and beyond GROSS_PX. Plain noise of two
 #: coordinates reaches seven once in 10^10.
 GROSS_SIGMAS, GROSS_PX = 7.0, 1.0
+#: Nor is a corner wrong within this share of its picture's squares: so far boards bend.
+_BENDS_SHARE = 0.04
 #: A picture with fewer good corners, or a smaller share of them, is not used.
 FEWEST_CORNERS, LEAST_SHARE = 8, 0.5
 
@@ -32,7 +34,9 @@ class LeftOut:
 def wrong_corners(fitted: Adjusted, sightings: Sightings) -> BoolArray:
     """[V, C] which corners are off by more than noise explains."""
     distance = np.hypot(fitted.residuals_px[..., 0], fitted.residuals_px[..., 1])
-    return np.asarray(sightings.seen & (distance > max(GROSS_SIGMAS * fitted.sigma_px, GROSS_PX)))
+    bends = _BENDS_SHARE * sightings.square_px[:, None]
+    far = np.maximum(bends, max(GROSS_SIGMAS * fitted.sigma_px, GROSS_PX))
+    return np.asarray(sightings.seen & (distance > far))
 
 
 def useless_pictures(sightings: Sightings, wrong: BoolArray) -> BoolArray:

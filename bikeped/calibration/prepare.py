@@ -135,10 +135,7 @@ def _enough(views: Sequence[BoardView], found: Found) -> None:
 
 def _make_boards(fitted: Adjusted, sightings: Sightings) -> None:
     """Corners that lie nowhere near a board, even after the best fit."""
-    grid = sightings.uv_px.reshape(len(sightings), sightings.pattern.rows, -1, 2)
-    seen = sightings.seen.reshape(grid.shape[:3])
-    steps = np.linalg.norm(np.diff(grid, axis=2), axis=-1)[seen[:, :, 1:] & seen[:, :, :-1]]
-    square = float(np.median(steps)) if len(steps) else 0.0
+    square = float(np.median(sightings.square_px))
     if fitted.sigma_px > _MOST_NOISE_SHARE * square:
         raise CalibrationError(
             f"IMAGES: the corners make no {sightings.pattern.columns}x{sightings.pattern.rows} "

@@ -1,0 +1,207 @@
+"""The file that a calibration leaves, read back by everything that reads it; and the page."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration_scenes import boards, camera, found
+
+from bikeped.calibration.circle import brightest, circle_radius_px
+from bikeped.calibration.compare import Calibrated, calibrate, recommend
+from bikeped.calibration.model import Model
+from bikeped.calibration.outliers import LeftOut
+from bikeped.calibration.prepare import prepare
+from bikeped.calibration.report import Told, report_page
+from bikeped.calibration.report_pictures import Thumbnail
+from bikeped.calibration.results import cautions_of
+from bikeped.calibration.views import Refused
+from bikeped.calibration.write import Field, calibration_data, field_of_view, write_calibration
+from bikeped.config import ground_camera, load_config
+from bikeped.conformance.suite import Suite
+from bikeped.errors import CalibrationError
+from bikeped.geometry import Framing, Lens
+from bikeped.service.judge import Judge
+
+FRAMING = Framing(3840, 2160, 3840, 3500)
+K = (0.01, -0.012, 0.004, -0.0007)
+NOW = datetime.datetime(2031, 5, 6, 7, 8, 9, tzinfo=datetime.timezone.utc)
+
+
+@pytest.fixture(scope="module")
+def done() -> Calibrated:
+    """A 200 degree lens with four radial terms in the 3500 px crop."""
+    drawn = camera("equidistant", 100.0, K)
+    views = boards(drawn, 12, noise_px=0.3)
+    prepared = prepare(found(views, [Refused("<b>x.jpg", "same picture as a & b")]))
+    models = [Model("equidistant"), Model("equidistant", 4), Model("equidistant", 2, True)]
+    return calibrate(prepared, models, 3)
+
+
+def the_field(done: Calibrated, name: str = "equidistant+k4") -> Field:
+    return field_of_view(done.fits[name], 1750.0, FRAMING.window_px)
+
+
+def write_pair(done: Calibrated, folder: Path, name: str = "equidistant+k4") -> Path:
+    """The calibration file and a configuration that uses it."""
+    data = calibration_data(done, done.fits[name], the_field(done, name), FRAMING, NOW)
+    write_calibration(folder / "measured.json", data)
+    config = folder / "config.yaml"
+    config.write_text("camera: {calibration: measured.json, height_m: 3.6576}\n")
+    return config
+
+
+def test_the_ground_camera_has_exactly_the_fitted_lens(done: Calibrated, tmp_path: Path) -> None:
+    loaded = load_config(write_pair(done, tmp_path))
+    own = ground_camera(loaded)
+    fit = done.fits["equidistant+k4"]
+    assert own.lens.focal_px == fit.focal_px
+    assert own.lens.k == fit.state.terms
+    assert (own.cx, own.cy) == (fit.cx, fit.cy)
+    assert math.degrees(2 * own.lens.max_theta_rad) == pytest.approx(200, abs=1.5)
+    theta = np.linspace(0, own.lens.max_theta_rad, 50)
+    np.testing.assert_allclose(own.lens.radius(theta), fit.radius(theta), rtol=1e-12)
+    # The installer's way, by radius and field of view, gives the same lens.
+    data = json.loads((tmp_path / "measured.json").read_text())
+    again = Lens.from_circle(data["model"], data["radius_px"], data["fov_deg"], own.lens.k)
+    assert again.focal_px == pytest.approx(fit.focal_px, rel=1e-14)
+    both = load_config(
+        tmp_path / "config.yaml",
+        [f"camera.radius_px={data['radius_px']!r}", f"camera.fov_deg={data['fov_deg']!r}"],
+    )
+    assert ground_camera(both).lens.focal_px == pytest.approx(fit.focal_px, rel=1e-14)
+
+
+def test_run_replay_and_conformance_read_all_four_terms(done: Calibrated, tmp_path: Path) -> None:
+    config = write_pair(done, tmp_path)
+    loaded = load_config(config)
+    cut = load_config(config, ["camera.k3=0", "camera.k4=0"])
+    pixel = np.array([[2900.0, 2900.0]])
+    suites = [Suite.load([], loaded), Suite.load([], cut)]
+    judges = [Judge(loaded), Judge(cut)]  # the loop's own, for run and replay
+    for all_four, two in (suites, judges):
+        assert all_four.camera.lens.k == done.fits["equidistant+k4"].state.terms
+        here, _ = all_four.camera.ground(pixel)
+        there, _ = two.camera.ground(pixel)
+        assert np.abs(here - there).max() > 0.05  # metres: the higher terms count
+
+
+def test_the_file_has_its_keys(done: Calibrated, tmp_path: Path) -> None:
+    write_pair(done, tmp_path)
+    data = json.loads((tmp_path / "measured.json").read_text())
+    fit = done.fits["equidistant+k4"]
+    assert list(data)[:10] == [
+        *("model", "cx", "cy", "focal_length", "fov_deg", "radius_px"),
+        *("k1", "k2", "k3", "k4"),
+    ]
+    assert data["rms_error_px"] == fit.rms_px
+    assert data["cross_validated_px"] == fit.cross_validated_px
+    assert (data["num_frames"], data["num_points"]) == (12, 12 * 48)
+    assert (data["frame_width"], data["frame_height"]) == (3840, 2160)
+    assert (data["pad_size"], data["crop_size"]) == (3840, 3500)
+    assert data["date"] == "2031-05-06T07:08:09+00:00"
+    assert data["pictures_hash"] == "0" * 64
+    assert "theta^8" in data["convention"]
+    assert data["software_version"]
+
+
+def test_the_former_file_is_kept(done: Calibrated, tmp_path: Path) -> None:
+    path = tmp_path / "measured.json"
+    assert write_calibration(path, {"n": 1}) is None
+    assert write_calibration(path, {"n": 2}) == tmp_path / "measured.json.bak"
+    assert json.loads(path.read_text()) == {"n": 2}
+    assert json.loads((tmp_path / "measured.json.bak").read_text()) == {"n": 1}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["measured.json", "measured.json.bak"]
+
+
+def test_a_fit_that_is_no_lens_is_not_written(done: Calibrated) -> None:
+    fit = done.fits["equidistant+k4"]
+    too_far = Field(math.radians(179), 4000.0, "the image circle")
+    with pytest.raises(CalibrationError, match="no lens over 358"):
+        calibration_data(done, fit, too_far, FRAMING)
+
+
+def test_words_of_caution(done: Calibrated) -> None:
+    fit = done.fits["equidistant+k4"]
+    assert cautions_of(done, fit, the_field(done)) == []
+    wide = Field(math.radians(150), 2000.0, "the image circle")
+    assert any("extrapolated" in text for text in cautions_of(done, fit, wide))
+
+
+def test_the_image_circle_is_measured_on_the_pictures() -> None:
+    v, u = np.mgrid[0:780, 0:1030]
+    radius = np.hypot(u - 520, v - 380)
+    rng = np.random.default_rng(0)
+    grays = [
+        np.where(radius < 500, rng.integers(20, 255, radius.shape), 12).astype(np.uint8)
+        for _ in range(8)
+    ]
+    assert circle_radius_px(brightest(grays), np.array([520.0, 380.0])) == pytest.approx(500, abs=2)
+    full = [np.full((780, 1030), 128, np.uint8)]
+    assert circle_radius_px(brightest(full), np.array([520.0, 380.0])) is None
+
+
+class _Links(HTMLParser):
+    """What a page asks for from elsewhere, and its tags."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.elsewhere: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name in ("src", "href") and value and not value.startswith("data:"):
+                self.elsewhere.append(value)
+
+
+def test_the_page_is_whole_by_itself(done: Calibrated) -> None:
+    told = recommend(done)
+    chosen = done.fits["equidistant+k2+board"]
+    views = done.prepared.sightings.names
+    gray = np.random.default_rng(1).integers(0, 255, (2160, 3840), dtype=np.uint8)
+    page = report_page(
+        Told(
+            done, chosen, told, the_field(done), ["mind <this>"], ["upper left"], [(1, 1.5, 0, 1)]
+        ),
+        [Thumbnail(name, gray, FRAMING.offset_px) for name in views],
+    )
+    parser = _Links()
+    parser.feed(page)
+    assert parser.elsewhere == []
+    assert "script" not in parser.tags
+    assert parser.tags.count("svg") == 12
+    assert parser.tags.count("image") == 12
+    assert page.count("data:image/png;base64,") >= 4
+    assert "mind &lt;this&gt;" in page
+    assert "&lt;b&gt;x.jpg" in page
+    assert "same picture as a &amp; b" in page
+    assert f"{chosen.cross_validated_px:.3f} px" in page
+    assert re.search(r"<td>k2</td><td>-0\.0\d+", page)
+
+
+def test_the_page_names_corners_that_were_left_out(done: Calibrated) -> None:
+    from dataclasses import replace
+
+    prepared = replace(done.prepared, left_out=(LeftOut("c.jpg", 7, 31.4),))
+    page = report_page(
+        Told(
+            replace(done, prepared=prepared),
+            done.fits["equidistant"],
+            recommend(done),
+            the_field(done, "equidistant"),
+            [],
+            [],
+            [],
+        ),
+        [],
+    )
+    assert "c.jpg" in page
+    assert "corner 7: 31.4 px off" in page
