@@ -113,13 +113,18 @@ class HttpServer:
         return True
 
     async def stop(self) -> None:
-        """Stops serving; open requests get a second to end."""
+        """Stops serving; open requests get a second to end. Who takes nothing is cut off."""
         runner, self._runner, self.port = self._runner, None, None
         if self._server is not None:
             self._server.close()
             self._server = None
-        if runner is not None:
-            await runner.cleanup()
+        if runner is None or runner.server is None:
+            return
+        connections = [c.transport for c in runner.server.connections if c.transport is not None]
+        await runner.cleanup()
+        for connection in connections:
+            connection.abort()
+        await asyncio.sleep(0)  # in which they are let go
 
 
 class _TurnAway(asyncio.Protocol):

@@ -30,7 +30,9 @@ STATUS_S = 1.0
 WRITE_S = 10.0
 #: What may be on its way to a slow client: more would only be older when it arrives.
 _SEND_BUFFER = 128 * 1024
-_BOUNDARY = "picture"
+_BOUNDARY = "bikeped-picture-4c1d9f"
+#: Between two pictures; Chromium shows one when it has read the headers of the next.
+_EDGE = f"\r\n--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n\r\n".encode()
 
 
 class Live:
@@ -54,7 +56,7 @@ class Live:
     async def events(self, request: web.Request) -> web.StreamResponse:
         """Server-sent events: `hello` once, `now` up to ten a second, `status` every second,
         `alerts` when they change."""
-        with self._counted("_pages"):
+        with self._counted("_pages"), _until_left():
             response = web.StreamResponse(
                 headers={hdrs.CONTENT_TYPE: "text/event-stream", "X-Accel-Buffering": "no"}
             )
@@ -80,7 +82,7 @@ class Live:
                         parts.append(_event("trend", msgspec.json.encode(new)))
                 await _send(request, response, b"".join(parts))
                 await asyncio.sleep(1.0 / EVENTS_HZ)
-            return response
+        return response
 
     async def room(self, _request: web.Request) -> web.Response:
         """204 when there is room for one more page: browsers do not tell why a stream failed."""
@@ -89,21 +91,18 @@ class Live:
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """The picture with boxes, tracks and the pair, as Motion JPEG."""
-        with self._counted("_streams"), self.painter.looking():
+        with self._counted("_streams"), self.painter.looking(), _until_left():
             response = web.StreamResponse(
                 headers={hdrs.CONTENT_TYPE: f"multipart/x-mixed-replace; boundary={_BOUNDARY}"}
             )
             await response.prepare(request)
             _keep_little(request)
-            edge = f"--{_BOUNDARY}\r\n".encode()
-            await _send(request, response, edge)
+            await _send(request, response, _EDGE)
             number = -1
             while (picture := await self.painter.next(number)) is not None:
                 number, jpeg = picture
-                head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                # With the edge at once: browsers show a picture when the next one begins.
-                await _send(request, response, b"".join((head.encode(), jpeg, b"\r\n", edge)))
-            return response
+                await _send(request, response, jpeg + _EDGE)
+        return response
 
     @contextlib.contextmanager
     def _counted(self, what: str) -> Iterator[None]:
@@ -169,6 +168,13 @@ def add_live(app: web.Application, live: Live) -> None:
         live.close()
 
     app.on_shutdown.append(close)
+
+
+@contextlib.contextmanager
+def _until_left() -> Iterator[None]:
+    """A visitor who leaves is the usual end of a stream, and nothing to tell the log."""
+    with contextlib.suppress(ConnectionError):
+        yield
 
 
 def _event(name: str, data: bytes) -> bytes:

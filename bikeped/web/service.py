@@ -12,6 +12,7 @@ from bikeped.service.pages import Inside
 from bikeped.service.telemetry import as_mapping
 from bikeped.telemetry.http import add_monitoring
 from bikeped.types import Decision, Frame, Signal
+from bikeped.web.align import add_align
 from bikeped.web.live import Live, add_live
 from bikeped.web.security import open_access
 from bikeped.web.server import make_pages
@@ -38,6 +39,7 @@ class ServicePages:
         app = make_pages(
             self._access,
             partial(add_live, live=Live(self.watch, inside)),
+            partial(add_align, loaded=inside.loaded, frame=self.newest),
         )
         add_monitoring(app, inside.metrics, lambda: as_mapping(inside.health()))
         return app

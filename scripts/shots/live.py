@@ -1,4 +1,4 @@
-"""The live page: the demo's drawn crossing through the real loop, at its ALERT, and contact lost."""
+"""The live page: the demo's drawn crossing through the real loop, at its ALERT, and no contact."""
 
 from __future__ import annotations
 

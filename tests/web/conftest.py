@@ -50,7 +50,7 @@ ARGUMENTS = [
     "--disable-sync",
     "--force-color-profile=srgb",
 ]
-PATIENCE_S = 30.0  # reached only by a failure
+PATIENCE_S = 60.0  # reached only by a failure
 
 
 class Served:

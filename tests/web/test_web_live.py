@@ -190,15 +190,20 @@ class Pictures:
 
     def __init__(self, answer: aiohttp.ClientResponse) -> None:
         self._content = answer.content
+        boundary = answer.headers["Content-Type"].partition("boundary=")[2]
+        self._edge = f"\r\n--{boundary}\r\nContent-Type: image/jpeg\r\n\r\n".encode()
+        self._read = b""
 
     async def next(self) -> np.ndarray:
+        """The next picture that is whole: the edge after it has come."""
+
         async def read() -> np.ndarray:
-            length = None
-            while (line := (await self._content.readline()).strip()) or length is None:
-                name, _, value = line.partition(b": ")
-                if name == b"Content-Length":
-                    length = int(value)
-            return simplejpeg.decode_jpeg(await self._content.readexactly(length))
+            while True:
+                data, edge, rest = self._read.partition(self._edge)
+                if edge and data:
+                    self._read = rest
+                    return simplejpeg.decode_jpeg(data)
+                self._read = rest if edge else self._read + await self._content.readany()
 
         return await asyncio.wait_for(read(), PATIENCE_S)
 

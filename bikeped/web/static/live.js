@@ -176,6 +176,11 @@ function withoutName(name, sentence) {
 
 function startPicture() {
   if (paused || document.hidden) return;
+  if (document.readyState !== "complete") {
+    // A stream never ends: begun earlier, it would keep the page from ever being loaded.
+    addEventListener("load", startPicture, { once: true });
+    return;
+  }
   broken = false;
   pictureTried = performance.now();
   $("#picture").src = `/live/stream?from=${Date.now()}`;

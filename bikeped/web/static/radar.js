@@ -91,6 +91,7 @@ export class Radar {
     const places = new Map([...this.marks].map(([id, mark]) => [id, this.place(mark, at)]));
     for (const mark of this.marks.values()) this.drawTrail(context, mark, px);
     this.drawPair(context, places, px);
+    for (const [id, mark] of this.marks) this.drawArrow(context, mark, places.get(id), px);
     for (const [id, mark] of this.marks) this.drawMark(context, mark, places.get(id), px, width, height);
   }
 
@@ -197,6 +198,17 @@ export class Radar {
     context.fillText(word, u, v + 0.5);
   }
 
+  // Where it will be in a second.
+  drawArrow(context, mark, [x, y], px) {
+    if (Math.hypot(mark.vx, mark.vy) < 0.3 || Math.hypot(x, y) > this.range) return;
+    context.strokeStyle = colour(`--${mark.kind}`);
+    context.lineWidth = 2;
+    context.beginPath();
+    context.moveTo(...px(x, y));
+    context.lineTo(...px(x + mark.vx, y + mark.vy));
+    context.stroke();
+  }
+
   drawMark(context, mark, [x, y], px, width, height) {
     const far = Math.hypot(x, y) > this.range;
     const k = far ? this.range / Math.hypot(x, y) : 1;
@@ -205,16 +217,6 @@ export class Radar {
     const ink = colour(`--${mark.kind}`);
     const fast = Math.hypot(mark.vx, mark.vy);
     const angle = fast > 0.3 ? Math.atan2(mark.vy, mark.vx) : 0;
-    if (!far && fast > 0.3) {
-      // where it will be in a second
-      const [tu, tv] = px(x + mark.vx, y + mark.vy);
-      context.strokeStyle = ink;
-      context.lineWidth = 2;
-      context.beginPath();
-      context.moveTo(u, v);
-      context.lineTo(tu, tv);
-      context.stroke();
-    }
     context.save();
     context.translate(u, v);
     context.rotate(angle);
