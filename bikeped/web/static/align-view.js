@@ -86,12 +86,14 @@ export class View {
     return Math.min(this.width / this.size.width, this.height / this.size.height);
   }
 
-  // All of it on a wide screen; a narrow one is filled, for there the ground is what matters.
+  // All of it on a wide screen; a narrow one is filled; on a phone the ground is what matters.
   start() {
     if (!this.width) return;
     const fill = Math.max(this.width / this.size.width, this.height / this.size.height);
     const narrow = this.width / this.height < 0.9 * (this.size.width / this.size.height);
-    this.show(narrow ? fill : this.contain());
+    if (this.width >= 640) return this.show(narrow ? fill : this.contain());
+    this.show(1.35 * fill);
+    this.top = this.height - 0.97 * this.size.height * this.scale;
   }
 
   show(scale) {
@@ -290,7 +292,8 @@ export class View {
       pin.setAttribute("aria-label", `Mark ${mark.name}${mark.says ? `, ${mark.says}` : ""}`);
       pin.setAttribute("aria-pressed", String(Boolean(mark.chosen)));
       pin.classList.toggle("off", Boolean(mark.off));
-      pin.lastChild.textContent = mark.tag ?? mark.name;
+      // On a small screen only the chosen mark says what it reads.
+      pin.lastChild.textContent = mark.chosen || this.width > 640 ? mark.tag ?? mark.name : mark.name;
     }
     this.repaint();
   }

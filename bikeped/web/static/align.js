@@ -1,6 +1,6 @@
 // The align page: numbers, marks, fit, save. What any of it means on the ground the box works out.
 
-import { $, announce, el, fixed, request, setText, toast } from "/static/ui.js";
+import { $, announce, el, fixed, metres, request, setText, toast } from "/static/ui.js";
 import { MarkList } from "/static/align-marks.js";
 import { KINDS, View } from "/static/align-view.js";
 
@@ -170,10 +170,10 @@ function showTen(ten) {
       : "");
   }
   if (!ten) return setText(place, "10 m is not in view.");
-  if (ten.reads_m === null) return place.replaceChildren("What read 10 m is ", el("b", {}, "above the horizon"), " now.");
+  if (ten.reads_m === null) return place.replaceChildren("10 m mark: ", el("b", {}, "above the horizon"), " now.");
   const moved = ten.reads_m - ten.was_m;
-  place.replaceChildren("What read 10 m reads ", el("b", { id: "ten-figure" }, fixed(ten.reads_m, 2, " m")),
-    Math.abs(moved) < 0.005 ? "" : ` (${sign(moved, 2)} m)`);
+  place.replaceChildren("10 m mark now reads ", el("b", { id: "ten-figure" }, metres(ten.reads_m, 2)),
+    Math.abs(moved) < 0.005 ? "" : ` (${sign(moved, 2)}\u00a0m)`);
 }
 
 // --- marks
@@ -193,13 +193,13 @@ function showReadings(readings) {
       mark.tag = `${mark.name}: above the horizon`;
       continue;
     }
-    const side = `${fixed(Math.abs(reading.right_m), 2, " m")} ${reading.right_m < 0 ? "left" : "right"}`;
-    mark.says = `reads ${fixed(reading.distance_m, 2, " m")}, ${side}`;
-    mark.tag = `${mark.name}: ${fixed(reading.distance_m, 2, " m")}`;
+    const side = `${metres(Math.abs(reading.right_m), 2)} ${reading.right_m < 0 ? "left" : "right"}`;
+    mark.says = `reads ${metres(reading.distance_m, 2)}, ${side}`;
+    mark.tag = `${mark.name}: ${metres(reading.distance_m, 2)}`;
     if (typeof mark.distance_m === "number") {
       const off = reading.distance_m - mark.distance_m;
-      mark.says += `; ${sign(100 * off, 0)} cm`;
-      if (Number.isFinite(mark.right_m)) mark.says += `, to the side ${sign(100 * (reading.right_m - mark.right_m), 0)} cm`;
+      mark.says += `; off ${sign(100 * off, 0)} cm`;
+      if (Number.isFinite(mark.right_m)) mark.says += `, sideways ${sign(100 * (reading.right_m - mark.right_m), 0)} cm`;
     }
   }
   showMarks();
@@ -328,7 +328,7 @@ function showFit(answer, next) {
   const rows = answer.residuals.map((row) => el("tr", {},
     el("th", { scope: "row" }, row.mark), el("td", {}, { distance: "distance", right: "right", forward: "forward", spacing: "between" }[row.what]),
     el("td", { class: "number" }, minus(fixed(row.measured_m, 2))), el("td", { class: "number" }, minus(fixed(row.read_m, 2))),
-    el("td", { class: "number" }, sign(100 * row.off_m, 1), row.strange ? el("span", { class: "bad-mark" }, "") : null)));
+    el("td", { class: "number" }, row.strange ? el("span", { class: "bad-mark" }, el("span", { class: "unseen" }, "strange: ")) : null, sign(100 * row.off_m, 1))));
   const head = ["Mark", "What", "Tape, m", "Reads, m", "Off, cm"].map((text, i) => el("th", { scope: "col", class: i > 1 ? "number" : null }, text));
   said.push(el("div", { class: "scroll" }, el("table", {}, el("caption", { class: "unseen" }, "What is left over"), el("thead", {}, el("tr", {}, head)), el("tbody", {}, rows))));
   $("#fit-answer").replaceChildren(...said);
