@@ -66,7 +66,16 @@ def in_turns(
 
 
 def main() -> int:
-    from benchmarks import conformance, detection, loop, scene, table, tracking
+    from benchmarks import (
+        bundled,
+        calibration,
+        conformance,
+        detection,
+        loop,
+        scene,
+        table,
+        tracking,
+    )
 
     known: dict[str, Callable[[Figures], None]] = {
         "table": table.run,
@@ -74,8 +83,10 @@ def main() -> int:
         "nms": detection.nms,
         "tracking": tracking.run,
         "loop": loop.run,
+        "bundled": bundled.run,
         "conformance": conformance.run,
         "scene": scene.run,
+        "calibration": calibration.run,
     }
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="BENCHMARK", help=", ".join(known))

@@ -1,0 +1,111 @@
+"""Calibration: the fit in blocks beside scipy's least_squares on the whole, and the whole run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from bench import Figures
+
+    from bikeped.calibration.model import Sightings, State
+    from bikeped.calibration.views import BoardView
+
+_PICTURES = Path(__file__).parents[3] / "shared" / "media" / "fisheye-checkerboard"
+_RUNS = 3
+
+
+def run(figures: Figures) -> None:
+    from bikeped.calibration.adjust import adjust
+    from bikeped.calibration.initial import first_guess
+    from bikeped.calibration.model import Model, Sightings
+    from bikeped.calibration.views import BoardPattern
+
+    pattern = BoardPattern(8, 6)
+    model = Model("equidistant", 4)
+    small = Sightings.of(pattern, _boards(15, 1000, 190.0))
+    start = first_guess(small)
+    ours = _median(lambda: adjust(small, model, first_guess(small)))
+    obvious = _median(lambda: _dense(small, start), 1)
+    figures.add("fit of 15 boards from nothing, k1..k4", ours, obvious, "s", "< 0.2 s")
+    large = Sightings.of(pattern, _boards(42, 3500, 200.0))
+    start = first_guess(large)
+    ours = _median(lambda: adjust(large, model, first_guess(large)))
+    obvious = _median(lambda: _dense(large, start), 1)
+    figures.add("fit of 42 boards from nothing, k1..k4", ours, obvious, "s")
+    _whole(figures)
+
+
+def _boards(count: int, size: int, fov_deg: float) -> list[BoardView]:
+    from bikeped.calibration.synthetic import DrawnCamera, draw_views, spread_poses
+    from bikeped.calibration.views import BoardPattern
+    from bikeped.geometry import Lens
+
+    pattern = BoardPattern(8, 6)
+    lens = Lens.from_circle("equidistant", size / 2, fov_deg, (0.003, -0.008, 0.002, -0.0004))
+    camera = DrawnCamera(lens, size / 2 + 2, size / 2 + 9, size, size)
+    return draw_views(camera, pattern, spread_poses(camera, pattern, count), noise_px=0.3)
+
+
+def _dense(sightings: Sightings, start: State) -> None:
+    """The obvious way: all parameters in one vector, numeric Jacobian, the same two stages."""
+    from scipy.optimize import least_squares
+
+    from bikeped.calibration.model import State, residuals, rotation_vectors, rotations
+
+    views = len(sightings)
+    first = np.concatenate(
+        [start.lens, np.zeros(4), rotation_vectors(start.turn).ravel(), start.move.ravel()]
+    )
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        state = State(
+            "equidistant",
+            x[:7],
+            rotations(x[7 : 7 + 3 * views].reshape(-1, 3)),
+            x[7 + 3 * views :].reshape(-1, 3),
+            start.shape,
+        )
+        return residuals(state, sightings).ravel()
+
+    plain = least_squares(errors, first, x_scale="jac")
+    least_squares(errors, plain.x, x_scale="jac", loss="soft_l1", f_scale=0.9)
+
+
+def _whole(figures: Figures) -> None:
+    """Pictures to recommendation, in this process: what `bikeped calibrate` does after start-up."""
+    from bikeped.calibration.compare import calibrate, models_to_compare, recommend
+    from bikeped.calibration.corners import find_boards
+    from bikeped.calibration.model import Model
+    from bikeped.calibration.pictures import load_pictures
+    from bikeped.calibration.prepare import prepare
+    from bikeped.calibration.views import BoardPattern
+
+    def whole(paths: list[Path], models: list[Model]) -> Callable[[], object]:
+        def work() -> object:
+            found = find_boards(load_pictures(paths), BoardPattern(8, 6))
+            return recommend(calibrate(prepare(found), models, 5))
+
+        return work
+
+    files = sorted(_PICTURES.glob("*.jpg"))
+    if files:
+        one, all_ = [Model("equidistant", 4)], models_to_compare(Model("equidistant", 4))
+        figures.add("15 real pictures, one model", _median(whole(files, one)), None, "s", "< 1 s")
+        figures.add("15 real pictures, --compare", _median(whole(files, all_)), None, "s", "< 1 s")
+
+
+def _median(work: Callable[[], object], runs: int = _RUNS) -> float:
+    """Median seconds after one warm-up (none for a single run, which takes seconds)."""
+    if runs > 1:
+        work()
+    times = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))
