@@ -146,8 +146,9 @@ def profile_figure(fit: Fit, field: Field) -> bytes:
         "projections, each with its own best focal length over the angles that were measured, are "
         "from it. Grey: angles that no corner reached, where the profile is extrapolated.",
         width=7.0,
-        height=3.3,
+        height=3.2,
         columns=2,
+        legend_rows=1,
     ) as sheet:
         left, right = sheet.axes
         left.plot(degrees, own, color=BLACK, lw=2.2, label=fit.name)
@@ -169,12 +170,12 @@ def profile_figure(fit: Fit, field: Field) -> bytes:
             axes.set_xlabel("angle from the axis, degrees")
         left.set_ylabel("radius, px")
         left.set_ylim(0, float(own.max()) * 1.1)
-        left.legend(loc="upper left")
         right.axhline(0, color=BLACK, lw=0.8)
         bound = max(3 * worst, 1.0)
         right.set_ylim(-bound, bound)
         right.set_ylabel("ideal minus fitted radius, px")
-        right.legend(loc="lower left")
+        handles = [*left.get_lines()[:1], *right.get_lines()[: len(FISHEYE)]]
+        sheet.legend(handles, columns=5)
         return png(sheet)
 
 
@@ -182,7 +183,9 @@ def board_figure(fit: Fit) -> bytes:
     """The board's fitted shape: out of the plane as colours, in the plane as arrows."""
     pattern = fit.sightings.pattern
     flat, shape = fit.sightings.flat, fit.state.shape * 100
-    height = shape[:, 2].reshape(pattern.rows, pattern.columns)
+    # Counted as in a mirror, the board's z axis looks at the camera.
+    facing = (fit.state.turn[:, :, 2] * fit.state.move).sum(-1)
+    height = np.sign(np.median(facing)) * shape[:, 2].reshape(pattern.rows, pattern.columns)
     bound = max(float(np.abs(height).max()), 0.1)
     with Sheet(
         "The board as it is",

@@ -91,10 +91,15 @@ def _frame(uv: FloatArray, arrows: FloatArray, fit: Fit) -> tuple[FloatArray, Fl
     points = np.concatenate([uv, uv + arrows])
     low, high = points.min(0), points.max(0)
     middle = (low + high) / 2
+    picture = np.array([fit.sightings.width, fit.sightings.height], dtype=np.float64)
     span = np.maximum((high - low) * (1 + 2 * _MARGIN_SHARE), _LEAST_SPAN_PX)
-    width = float(max(span[0], span[1] * 1.5))
+    width = float(min(max(span[0], span[1] * 1.5), max(picture[0], picture[1] * 1.5)))
     size = np.array([width, width / 1.5])
-    return middle - size / 2, middle + size / 2
+    # Inside the picture where it is large enough, else in its middle.
+    room = np.maximum(picture - size, 0)
+    first = np.clip(middle - size / 2, 0, room)
+    first = np.where(room > 0, first, (picture - size) / 2)
+    return first, first + size
 
 
 def _image(thumbnail: Thumbnail, low: FloatArray, high: FloatArray, zoom: float) -> str:

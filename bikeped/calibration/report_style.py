@@ -14,7 +14,7 @@ section { background: #ffffff; border: 1px solid var(--line); border-radius: 8px
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(165px, 1fr)); gap: 10px; }
 .tile { background: #ffffff; border: 1px solid var(--line); border-radius: 8px;
   padding: 10px 14px; }
-.tile b { display: block; font-size: 20px; color: var(--blue); }
+.tile b { display: block; font-size: 18px; color: var(--blue); white-space: nowrap; }
 .tile span { font-size: 13px; color: var(--soft); }
 .caution { background: #fff4df; border: 1px solid #e0b050; border-radius: 8px;
   padding: 2px 18px 6px; margin-top: 14px; }
