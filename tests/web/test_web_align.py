@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
-from web_fakes import LOCKED, OPEN
+from web_fakes import LOCKED, OPEN, Scene, inside
 
 from bikeped.config import framing, ground_camera, load_config
 from bikeped.types import Frame
@@ -19,8 +19,20 @@ from bikeped.web.align import add_align
 from bikeped.web.align_grid import ground_grid
 from bikeped.web.align_points import values_of
 from bikeped.web.server import make_pages
+from bikeped.web.service import ServicePages
 
 ROOT = Path(__file__).parents[2]
+#: The camera that the fakes' frames are of.
+SMALL = (
+    "camera.width=960",
+    "camera.height=640",
+    "camera.projection=perspective",
+    "camera.calibration=null",
+    "camera.pad_size=null",
+    "camera.crop_size=null",
+    "camera.radius_px=580",
+    "camera.fov_deg=73",
+)
 FRAME = {"width": 3840, "height": 2160}
 
 
@@ -224,3 +236,22 @@ async def test_another_site_can_neither_ask_nor_save(place: Path, start) -> None
     )
     assert answer.status == 403
     assert content(place) == before
+
+
+async def test_the_service_s_newest_frame_is_the_picture(place: Path, start) -> None:
+    loaded = load_config(place, SMALL)
+    pages, within = ServicePages(loaded), inside(loaded)
+
+    class Served:
+        app = pages.application(within)
+
+    client = await start(Served)
+    assert (await client.get("/align/frame.jpg")).status == 503
+    outcome = Scene(within.judge).next()
+    await pages.frame(outcome)
+    answer = await client.get("/align/frame.jpg")
+    assert await answer.read() == bytes(outcome.picture.frame.jpeg or b"")
+    state = await (await client.get("/align/state")).json()
+    assert state["live"]
+    ask = {"values": state["running"], "frame": {"width": 960, "height": 640}}
+    assert (await client.post("/align/grid", json=ask)).status == 200
