@@ -105,6 +105,41 @@ def readjust(sightings: Sightings, fitted: Adjusted) -> State:
     return _kept(sightings, fitted.model, fitted.state, turn_px, "soft-l1")[0]
 
 
+@dataclass(frozen=True)
+class Linear:
+    """The last stage's equations at a fit: what it would be without some pictures, by one step.
+
+    A lens that many pictures made moves little when a few are taken away, and one undamped step of
+    Gauss and Newton from the optimum gets there (to 1 % of the held-out error, tested).
+    """
+
+    fitted: Adjusted
+    jac: Jacobian
+    pulled: FloatArray
+    seen: FloatArray
+    prior: _Prior | None
+
+    @staticmethod
+    def of(sightings: Sightings, fitted: Adjusted) -> Linear:
+        jac, pulled = whitened(
+            jacobian(fitted.state, sightings.flat),
+            fitted.residuals_px,
+            fitted.sigma_px * SOFT_L1_TURN,
+        )
+        prior = _Prior.of(sightings, fitted.state) if fitted.model.board else None
+        return Linear(fitted, jac, pulled, sightings.seen.astype(np.float64), prior)
+
+    def without(self, out: BoolArray) -> State:
+        """Lens and shape as the pictures that are not `out` [V] have them; poses of those."""
+        keep, state = ~out, self.fitted.state
+        jac = Jacobian(*(part[keep] for part in self.jac.parts))
+        basis = None if self.prior is None else self.prior.basis
+        normal = normal_equations(jac, self.pulled[keep], self.seen[keep], basis)
+        if self.prior is not None:
+            normal = self.prior.added(normal, state)
+        return moved(state.rows(keep), normal.step(0.0), basis)
+
+
 def _kept(
     sightings: Sightings, model: Model, start: State, turn_px: float | None, name: str
 ) -> tuple[State, Stage]:

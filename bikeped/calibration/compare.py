@@ -34,7 +34,7 @@ class Calibrated:
 
     prepared: Prepared
     fits: dict[str, Fit]  #: by name, as in the JSON
-    folds: int
+    folds: int  #: of the cross-validation; as many as pictures: each by itself
 
     @property
     def refused(self) -> tuple[Refused, ...]:
@@ -79,16 +79,17 @@ def calibrate(
     folds: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Calibrated:
-    """Fits every model; `progress` gets the number done. CalibrationError where the boards leave
-    the focal length open."""
+    """Fits every model; `progress` gets the number done. `folds` 0: each picture by itself.
+
+    CalibrationError where the boards leave the focal length open.
+    """
     fits: dict[str, Fit] = {}
     for number, model in enumerate(models):
         start = start_for(model, prepared.start, prepared)
-        fits[model.name] = fit(
-            prepared.sightings, model, start, min(folds, len(prepared.sightings))
-        )
+        fits[model.name] = fit(prepared.sightings, model, start, folds)
         progress(number + 1)
-    calibrated = Calibrated(prepared, fits, folds)
+    views = len(prepared.sightings)
+    calibrated = Calibrated(prepared, fits, min(folds or views, views))
     open_share = min(f.uncertainty["f"] / f.focal_px for f in fits.values())
     if not open_share < _WORST_FOCAL_SHARE:
         raise CalibrationError(

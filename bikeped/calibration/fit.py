@@ -111,10 +111,11 @@ class Fit:
 
 
 @one_thread
-def fit(sightings: Sightings, model: Model, start: State, folds: int = 0) -> Fit:
-    """Adjusts the model from `start`, its uncertainty, and with `folds` > 1 cross-validates it."""
+def fit(sightings: Sightings, model: Model, start: State, folds: int | None = None) -> Fit:
+    """Adjusts the model from `start`, its uncertainty, and cross-validates it over `folds`
+    (0: each picture by itself; None: not at all)."""
     adjusted = adjust(sightings, model, start)
-    held_out = held_out_residuals(adjusted, sightings, folds) if folds > 1 else None
+    held_out = held_out_residuals(adjusted, sightings, folds) if folds is not None else None
     return Fit(
         model,
         adjusted.state,

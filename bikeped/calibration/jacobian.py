@@ -31,6 +31,11 @@ class Jacobian:
     pose: FloatArray
     shape: FloatArray
 
+    @property
+    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Its arrays, in order."""
+        return self.uv_px, self.lens, self.pose, self.shape
+
 
 def jacobian(state: State, flat: FloatArray) -> Jacobian:
     """The derivatives at `state` for a board that is `flat` [C, 3] plus the state's shape."""
@@ -46,21 +51,21 @@ def jacobian(state: State, flat: FloatArray) -> Jacobian:
     square = side * side + z * z
     theta = np.arctan2(side, z)
 
-    k = state.lens[PLAIN:]
+    k = state.lens[..., PLAIN:]
     base = curve(state.projection, theta)
     grown = gain(theta, k)
     unit = base * grown
     slope = curve_slope(state.projection, theta) * grown + base * _bend(theta, k)
-    focal = state.lens[2]
+    focal = state.lens[..., 2]
     ux, uy = x / side, y / side
 
-    lens = np.zeros((*theta.shape, 2, len(state.lens)))
+    lens = np.zeros((*theta.shape, 2, state.lens.shape[-1]))
     lens[..., 0, 0] = 1.0
     lens[..., 1, 1] = 1.0
     lens[..., 0, 2] = unit * ux
     lens[..., 1, 2] = unit * uy
     power = focal * base
-    for term in range(len(k)):
+    for term in range(k.shape[-1]):
         power = power * theta * theta
         lens[..., 0, PLAIN + term] = power * ux
         lens[..., 1, PLAIN + term] = power * uy
@@ -86,7 +91,8 @@ def jacobian(state: State, flat: FloatArray) -> Jacobian:
     pose[..., 3:] = to_point
     shape = to_point @ state.turn[:, None]
     radius = focal * unit
-    uv = np.stack([state.lens[0] + radius * ux, state.lens[1] + radius * uy], axis=-1)
+    centre = state.lens[..., :2]
+    uv = np.stack([centre[..., 0] + radius * ux, centre[..., 1] + radius * uy], axis=-1)
     return Jacobian(uv, lens, pose, shape)
 
 
@@ -94,6 +100,6 @@ def _bend(theta: FloatArray, k: FloatArray) -> FloatArray:
     """Derivative of `gain`."""
     square = theta * theta
     total = np.zeros_like(theta)
-    for number in range(len(k), 0, -1):
-        total = total * square + 2 * number * k[number - 1]
+    for number in range(k.shape[-1], 0, -1):
+        total = total * square + 2 * number * k[..., number - 1]
     return np.asarray(total * theta)

@@ -119,6 +119,9 @@ class Sightings:
 class State:
     """One guess at everything: `lens` [3 + terms] (cx, cy, f, k1 ...), `turn` [V, 3, 3] and
     `move` [V, 3] from board to camera, `shape` [C, 3]: offsets from the flat board, in squares.
+
+    For cross-validation every picture may have a lens and a shape of its own: `lens`
+    [V, 1, 3 + terms] and `shape` [V, C, 3].
     """
 
     projection: Projection
@@ -140,7 +143,7 @@ class State:
 
 
 def board_points(state: State, flat: FloatArray) -> FloatArray:
-    """[C, 3] the board's corners in its own frame."""
+    """[C, 3] (or [V, C, 3]) the board's corners in its own frame."""
     return flat + state.shape
 
 
@@ -157,11 +160,11 @@ def angles(points: FloatArray) -> FloatArray:
 
 
 def gain(theta: FloatArray, k: FloatArray) -> FloatArray:
-    """1 + k1 theta^2 + k2 theta^4 + ...: `Lens`'s convention."""
+    """1 + k1 theta^2 + k2 theta^4 + ...: `Lens`'s convention. `k` [..., terms]."""
     square = theta * theta
     total = np.zeros_like(theta)
-    for term in k[::-1]:
-        total = (total + term) * square
+    for term in range(k.shape[-1] - 1, -1, -1):
+        total = (total + k[..., term]) * square
     return 1 + total
 
 
@@ -169,9 +172,10 @@ def project(state: State, points: FloatArray) -> FloatArray:
     """Pixels [..., 2] of camera points [..., 3]."""
     side = np.hypot(points[..., 0], points[..., 1])
     theta = np.arctan2(side, points[..., 2])
-    radius = state.lens[2] * curve(state.projection, theta) * gain(theta, state.lens[PLAIN:])
+    lens = state.lens
+    radius = lens[..., 2] * curve(state.projection, theta) * gain(theta, lens[..., PLAIN:])
     scale = radius / np.where(side > 0, side, 1.0)
-    return np.asarray(points[..., :2] * scale[..., None] + state.lens[:2])
+    return np.asarray(points[..., :2] * scale[..., None] + lens[..., :2])
 
 
 def residuals(state: State, sightings: Sightings) -> FloatArray:

@@ -36,7 +36,7 @@ def result_data(
         "recommended": recommendation.name,
         "recommended_why": recommendation.why,
         "chosen": chosen.name,
-        "folds": min(calibrated.folds, len(sightings)),
+        "folds": calibrated.folds,
         "cautions": cautions,
         "pictures_hash": prepared.pictures_hash,
         "fits": {name: fit_data(fit) for name, fit in calibrated.fits.items()},

@@ -11,29 +11,39 @@ from dataclasses import replace
 
 import numpy as np
 
-from bikeped.calibration.adjust import Adjusted, readjust
+from bikeped.calibration.adjust import Adjusted, Linear, readjust
 from bikeped.calibration.jacobian import jacobian
 from bikeped.calibration.model import Sightings, State, residuals, rotations
 from bikeped.types import FloatArray, IntArray
 
+#: Fewer pictures than this are fitted anew for every fold; with more, one step is as good.
+_FIT_ANEW = 10
+
 
 def folds_of(pictures: int, folds: int) -> IntArray:
-    """[pictures] the fold of each: dealt in turn, so that neighbours in time are split."""
-    return np.arange(pictures) % min(folds, pictures)
+    """[pictures] the fold of each: dealt in turn, so that neighbours in time are split.
+
+    `folds` 0: each picture by itself.
+    """
+    return np.arange(pictures) % min(folds or pictures, pictures)
 
 
 def held_out_residuals(fitted: Adjusted, sightings: Sightings, folds: int) -> FloatArray:
     """[V, C, 2] residuals of each picture under the lens that the other folds give, pixels."""
     fold = folds_of(len(sightings), folds)
-    left = np.zeros_like(fitted.residuals_px)
+    linear = Linear.of(sightings, fitted) if len(sightings) >= _FIT_ANEW else None
+    lens = np.empty((len(sightings), 1, len(fitted.state.lens)))
+    shape = np.empty((len(sightings), *fitted.state.shape.shape))
     for number in range(fold.max() + 1):
         out = fold == number
-        near = replace(fitted, state=fitted.state.rows(~out))
-        train = readjust(sightings.rows(~out), near)
-        held = sightings.rows(out)
-        state = replace(train, turn=fitted.state.turn[out], move=fitted.state.move[out])
-        left[out] = residuals(fit_poses(state, held), held)
-    return left
+        if linear is not None:
+            train = linear.without(out)
+        else:
+            near = replace(fitted, state=fitted.state.rows(~out))
+            train = readjust(sightings.rows(~out), near)
+        lens[out], shape[out] = train.lens, train.shape
+    state = replace(fitted.state, lens=lens, shape=shape)
+    return residuals(fit_poses(state, sightings), sightings)
 
 
 def fit_poses(start: State, sightings: Sightings, steps: int = 20) -> State:

@@ -78,8 +78,9 @@ def _dense(sightings: Sightings, start: State) -> None:
 
 def _whole(figures: Figures) -> None:
     """Pictures to recommendation, in this process: what `bikeped calibrate` does after start-up."""
-    from bikeped.calibration.compare import calibrate, models_to_compare, recommend
     from bikeped.calibration.corners import find_boards
+
+    from bikeped.calibration.compare import calibrate, models_to_compare, recommend
     from bikeped.calibration.model import Model
     from bikeped.calibration.pictures import load_pictures
     from bikeped.calibration.prepare import prepare

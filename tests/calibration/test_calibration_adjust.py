@@ -10,6 +10,7 @@ import pytest
 from calibration_scenes import PATTERN, boards, camera, found
 
 from bikeped.calibration import adjust as adjust_module
+from bikeped.calibration import validate as validate_module
 from bikeped.calibration.adjust import Stage, adjust, minimise
 from bikeped.calibration.board_shape import gauge_basis
 from bikeped.calibration.compare import start_for
@@ -251,8 +252,23 @@ def test_held_out_pictures_do_not_help() -> None:
     assert np.abs(again[out]).max() > np.abs(held[out]).max()
 
 
-@pytest.mark.parametrize(("pictures", "folds"), [(15, 5), (4, 10), (7, 3)])
+@pytest.mark.parametrize("board", [False, True])
+def test_one_step_predicts_like_a_fit_without_the_picture(
+    board: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = camera(size=1000)
+    sightings = Sightings.of(PATTERN, boards(truth, 12, bend=BoardBend(0.02, 0.01)))
+    done = adjust(sightings, Model("equidistant", 2, board), first_guess(sightings))
+    step = held_out_residuals(done, sightings, 0)
+    monkeypatch.setattr(validate_module, "_FIT_ANEW", 1000)
+    anew = held_out_residuals(done, sightings, 0)
+    assert not np.array_equal(step, anew)
+    assert np.sqrt((step**2).sum() / (anew**2).sum()) == pytest.approx(1, abs=0.01)
+    assert (step**2).sum() > (done.residuals_px**2).sum()
+
+
+@pytest.mark.parametrize(("pictures", "folds"), [(15, 5), (4, 10), (7, 3), (6, 0)])
 def test_folds_are_even(pictures: int, folds: int) -> None:
     count = np.bincount(folds_of(pictures, folds))
-    assert len(count) == min(pictures, folds)
+    assert len(count) == min(pictures, folds or pictures)
     assert count.max() - count.min() <= 1
