@@ -89,7 +89,7 @@ def _whole(figures: Figures) -> None:
     def whole(paths: list[Path], models: list[Model]) -> Callable[[], object]:
         def work() -> object:
             found = find_boards(load_pictures(paths), BoardPattern(8, 6))
-            return recommend(calibrate(prepare(found), models, 5))
+            return recommend(calibrate(prepare(found), models, 0))
 
         return work
 
