@@ -13,6 +13,7 @@ from bikeped.cli.guard import guarded
 from bikeped.config import Config, framing, ground_camera, load_config
 from bikeped.errors import ConfigError
 from bikeped.geometry import GroundTable
+from bikeped.models import model_file
 
 
 @click.group("config")
@@ -34,9 +35,10 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
     GroundTable(camera, *frame.crop_wh, step_px=64)
     check_light(loaded.config.feedback)
     model = loaded.config.detection.model
-    if model is not None and not loaded.path(model).is_file():
+    file = None if model is None else model_file(model, loaded.base_dir)
+    if file is not None and not file.is_file():
         raise ConfigError(
-            f"{loaded.source}: detection.model: {loaded.path(model)} does not exist; correct the "
+            f"{loaded.source}: detection.model: {file} does not exist; correct the "
             "path or export the model there"
         )
     report = {
@@ -45,7 +47,7 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
         "config_hash": loaded.hash,
         "calibration_hash": loaded.calibration_hash,
         "focal_length_px": camera.lens.focal_px,
-        "model": None if model is None else str(loaded.path(model)),
+        "model": None if file is None else str(file),
     }
     if json_path is not None:
         write_json(report, json_path)

@@ -17,6 +17,7 @@ from bikeped.config.calibration import Calibration, load_calibration
 from bikeped.config.sections import Config
 from bikeped.config.sections_output import is_loopback
 from bikeped.errors import ConfigError
+from bikeped.models import BUNDLED
 
 _MAX_BYTES = 1_000_000
 _MAX_NODES = 20_000
@@ -210,7 +211,7 @@ def _apply(data: dict[str, Any], override: str) -> None:
         value = load_yaml(text)
     except ValueError as error:
         raise ConfigError(f"{said}: {error}; quote the value") from error
-    if key.strip() in _PATH_KEYS and isinstance(value, str) and value:
+    if key.strip() in _PATH_KEYS and isinstance(value, str) and value not in ("", BUNDLED):
         value = str(_expanded(value).absolute())
     node = data
     for part in parts[:-1]:

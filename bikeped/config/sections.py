@@ -165,7 +165,11 @@ class DetectionConfig(Section, frozen=True):
 
     model: Annotated[
         str | None,
-        Meta(description="model file, .onnx or .engine, relative to this file; null: none"),
+        Meta(
+            description="model file, .onnx or .engine, relative to this file; bundled: the small "
+            "one that comes with bikeped, which knows drawn streets only and is for demo and "
+            "self-test, never for a street; null: none"
+        ),
     ] = None
     sha256: Annotated[
         Annotated[str, Meta(pattern="^[0-9a-fA-F]{64}$")] | None,

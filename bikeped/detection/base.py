@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from bikeped.detection.hashing import checked_sha256
 from bikeped.errors import DetectorError
+from bikeped.models import model_file
 from bikeped.types import Detections, ImageArray
 
 if TYPE_CHECKING:
@@ -63,14 +64,15 @@ class Detector(Protocol):
 def load_detector(config: DetectionConfig, base_dir: Path) -> Detector:
     """The detector that `detection` describes, warmed up: the first frame is no slower than others.
 
-    `base_dir` is the folder that a relative `detection.model` starts from. Raises `DetectorError`
+    `base_dir` is the folder that a relative `detection.model` starts from; `bundled` is the model
+    that comes with bikeped. Raises `DetectorError`
     where there is no model, its hash differs, or it cannot be run or understood.
     """
     if config.model is None:
         raise DetectorError(
-            "detection.model: no model is configured; name an .onnx or .engine file"
+            "detection.model: no model is configured; name an .onnx or .engine file, or bundled"
         )
-    path = base_dir / Path(config.model).expanduser()
+    path = model_file(config.model, base_dir)
     # Imported where needed: a pole with an engine does without onnxruntime, and the reverse.
     if path.suffix.lower() == ".onnx":
         from bikeped.detection.onnx_runtime import OnnxDetector

@@ -31,6 +31,7 @@ from bikeped.errors import BikepedError, CaptureError
 from bikeped.feedback import open_light
 from bikeped.feedback.light import LAMP_COLOURS
 from bikeped.feedback.sounds import make_wav
+from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.service.judge import Judge
 from bikeped.service.parts import load_eye
 from bikeped.service.vision import Picture
@@ -196,6 +197,8 @@ def check_model(loaded: LoadedConfig) -> Finding:
         times.append((time.perf_counter() - began) * 1e3)
     ms = statistics.median(times)
     detail = f"{eye.name}: {ms:.1f} ms a frame, loaded in {loaded_s:.1f} s"
+    if loaded.config.detection.model == BUNDLED:
+        return Finding("model", "warn", f"{detail}; {NOT_FOR_STREETS}", "name a model of real ones")
     if ms > 1e3 / camera.fps:
         return Finding(
             "model",

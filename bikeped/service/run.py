@@ -16,6 +16,7 @@ from bikeped.capture import FrameGrabber, FrameSource, Paced, open_source
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_driver, open_speaker
+from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.service.announcer import Announcer
 from bikeped.service.feed import LiveFeed
 from bikeped.service.health import tell_health
@@ -79,6 +80,8 @@ async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> in
         if eye is None:
             return 0
         log.info("detector: %s, sha256 %s", eye.name, eye.model_hash or "none")
+        if loaded.config.detection.model == BUNDLED:
+            log.warning("detection.model: %s", NOT_FOR_STREETS)
         async with contextlib.AsyncExitStack() as stack:
             return await _serve(loaded, judge, eye, light, notifier, stop, stack, last, pages)
 

@@ -21,7 +21,7 @@ from bikeped.types import FloatArray, ImageArray, IntArray
 
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
 _LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
-_NOISES, _NOISIEST = 16, 10.0  #: patterns, standard deviation of the strongest in grey levels
+_NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest in grey levels
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class CropSettings:
 
     view: tuple[int, int] = (960, 544)  #: width and height of the network's input, pixels
     window: tuple[int, int] = (480, 288)
-    around_object: float = 0.55  #: share of windows that are cut around an object
-    around_usual: float = 0.25  #: share cut where some other picture has an object
-    scale: tuple[float, float] = (0.8, 1.3)
+    around_object: float = 0.65  #: share of windows that are cut around an object
+    around_usual: float = 0.2  #: share cut where some other picture has an object
+    scale: tuple[float, float] = (0.85, 1.3)
     flip: float = 0.5
     cover: float = 0.15  #: share of windows with something in front of an object
-    light: float = 0.9  #: share of windows whose light and colours are changed
+    light: float = 0.7  #: share of windows whose light and colours are changed
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,10 @@ class Cutter:
         count = len(view.box_px)
         kind = random.random() - self._settings.around_object
         if count and kind < 0:
-            box = view.box_px[int(random.integers(count))]
+            # First the class, then the object: parked cars must not crowd out who walks.
+            kinds = np.unique(view.class_id)
+            mine = np.flatnonzero(view.class_id == kinds[int(random.integers(len(kinds)))])
+            box = view.box_px[mine[int(random.integers(len(mine)))]]
             middle = (box[:2] + box[2:]) / 2
             left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)
         elif len(self._usual) and kind < self._settings.around_usual:
@@ -177,18 +180,18 @@ class Cutter:
     def _relit(self, rgb: ImageArray, random: np.random.Generator) -> ImageArray:
         """Another exposure, white balance, contrast, blur and noise."""
         value = np.arange(256) / 255.0
-        gamma = np.exp(random.uniform(-0.4, 0.4))
-        gain = np.exp(random.uniform(-0.35, 0.35)) * np.exp(random.uniform(-0.12, 0.12, 3))
-        lift = random.uniform(-0.08, 0.08)
+        gamma = np.exp(random.uniform(-0.25, 0.25))
+        gain = np.exp(random.uniform(-0.25, 0.25)) * np.exp(random.uniform(-0.08, 0.08, 3))
+        lift = random.uniform(-0.05, 0.05)
         tables = ((value**gamma)[:, None] * gain + lift).clip(0, 1) * 255
         out = np.asarray(cv2.LUT(rgb, tables.astype(np.uint8).reshape(256, 1, 3)), np.uint8)
-        if random.random() < 0.3:  # paler, or stronger colours
+        if random.random() < 0.2:  # paler, or stronger colours
             grey = cv2.cvtColor(cv2.cvtColor(out, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-            share = float(random.uniform(-0.3, 1.0))
+            share = float(random.uniform(-0.3, 0.7))
             out = np.asarray(cv2.addWeighted(out, 1 - share, grey, share, 0), np.uint8)
-        if random.random() < 0.25:
-            out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(random.uniform(0.3, 0.9))))
-        if random.random() < 0.4:
+        if random.random() < 0.1:
+            out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(random.uniform(0.3, 0.6))))
+        if random.random() < 0.3:
             noise = self._noise[int(random.integers(_NOISES))]
             out = np.asarray(cv2.add(out, noise, dtype=cv2.CV_8U), np.uint8)
         return out

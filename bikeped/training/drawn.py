@@ -57,10 +57,10 @@ def draw_set(
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataSetError(f"{folder}: is there already; choose another folder or remove it")
-    make_folder(folder)
     parts = -(-settings.pictures // settings.part)
     if parts > SEEDS_A_SET:
         raise DataSetError(f"pictures: {settings.pictures} are more than a set can have")
+    make_folder(folder)
     jobs = [
         (folder, number, min(settings.part, settings.pictures - number * settings.part))
         for number in range(parts)

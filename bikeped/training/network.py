@@ -4,8 +4,8 @@ One stage, no anchors: three grids of strides 8, 16 and 32 pixels, each cell of 
 likely a road user of each class has its middle there and how far its four edges are from the cell's
 own centre. Only plain convolutions and ReLU, which every runtime has fast code for.
 
-    stem    3 -> 16 -> 32 channels at 1/4 of the picture's size
-    stages  64, 128, 160 channels at 1/8, 1/16, 1/32; each a few convolutions on half of the
+    stem    3 -> 16 -> 32 channels at 1/4 of the picture's size, where wheels are told from legs
+    stages  64, 96, 128 channels at 1/8, 1/16, 1/32; each a few convolutions on half of the
             channels, whose answers are all joined (as in CSP and ELAN networks)
     neck    from coarse to fine, so that small figures are seen with what surrounds them
     heads   one convolution, then scores and edges
@@ -75,14 +75,16 @@ class SmallNet(nn.Module):
     def __init__(
         self,
         classes: int,
-        widths: tuple[int, ...] = (16, 32, 64, 128, 160),
+        widths: tuple[int, ...] = (16, 32, 64, 96, 128),
         depths: tuple[int, ...] = (2, 2, 1),
         neck: int = 48,
     ) -> None:
         super().__init__()
         self.classes = classes
         first, second, *stages = widths
-        self.stem = nn.Sequential(_Conv(3, first, stride=2), _Conv(first, second, stride=2))
+        self.stem = nn.Sequential(
+            _Conv(3, first, stride=2), _Conv(first, second, stride=2), _Stage(second, 1)
+        )
         self.stages = nn.ModuleList()
         taken = second
         for given, count in zip(stages, depths, strict=True):
