@@ -74,6 +74,7 @@ def main() -> int:
         loop,
         scene,
         table,
+        testbench,
         tracking,
     )
 
@@ -87,6 +88,7 @@ def main() -> int:
         "conformance": conformance.run,
         "scene": scene.run,
         "calibration": calibration.run,
+        "testbench": testbench.run,
     }
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="BENCHMARK", help=", ".join(known))

@@ -60,7 +60,7 @@ def command(
         web = msgspec.structs.replace(web, port=port)
     if host is not None:
         web = msgspec.structs.replace(web, host=host)
-    origin = Origin(config_path, scenarios_dir)
+    origin = Origin(config_path, scenarios_dir, overrides)
     screen = console()
     serve_pages(
         web,

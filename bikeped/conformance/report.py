@@ -224,7 +224,8 @@ def table_html(table: Table, link: str = "") -> str:
     )
     note = f"<p class=note>{escape(table.note)}</p>\n" if table.note else ""
     return (
-        f"<div class=scroll><table><caption>{escape(table.title)}{link}</caption>"
+        f'<div class=scroll tabindex=0 role=region aria-label="{escape(table.title)}">'
+        f"<table><caption>{escape(table.title)}{link}</caption>"
         f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>\n{note}"
     )
 

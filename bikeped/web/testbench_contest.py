@@ -30,10 +30,14 @@ class Origin:
 
     config: Path | None = None
     scenarios: Path | None = None
+    overrides: tuple[str, ...] = ()
 
     def options(self) -> list[str]:
         words = ["-c", str(self.config)] if self.config is not None else []
-        return words + (["--scenarios", str(self.scenarios)] if self.scenarios is not None else [])
+        words += ["--scenarios", str(self.scenarios)] if self.scenarios is not None else []
+        for item in self.overrides:
+            words += ["--set", item]
+        return words
 
 
 def challenge(work: Workbench, bench: Bench) -> Contest:
@@ -60,6 +64,8 @@ def contest_answer(work: Workbench, bench: Bench, origin: Origin) -> dict[str, A
     data["link"] = link_of(bench, base)
     data["changes"] = changes(bench, base)
     data["command"] = command_line(bench, base, origin)
+    again = ["bikeped", "testbench", "contest", "challenge.json", *origin.options()]
+    data["again"] = shlex.join(again)
     data["file"] = file_of(bench, base, facts(work.loaded))
     return data
 
@@ -118,8 +124,8 @@ def command_line(bench: Bench, base: Bench, origin: Origin) -> str | None:
         ),
     )
     different = changes(bench, base)
-    if said != bench or not different:
-        return None
+    if said != bench or not different or origin.overrides:
+        return None  # there, --set is what is contested
     words = ["bikeped", "conformance", "contest", *origin.options()]
     for change in different:
         section, _, name = change["key"].partition(".")

@@ -28,7 +28,14 @@ from bikeped.conformance.suite import Suite
 from bikeped.conformance.truth import Truth, TruthSettings, judge_truth
 from bikeped.errors import BikepedError
 from bikeped.geometry import CameraPose
-from bikeped.web.testbench_settings import Bench, Delay, Perception, mounted, own_scenarios
+from bikeped.web.testbench_settings import (
+    Bench,
+    Delay,
+    Perception,
+    mounted,
+    own_scenarios,
+    parse_own,
+)
 
 T = TypeVar("T")
 
@@ -141,14 +148,20 @@ class Workbench:
         self._seen: _Kept[Seen] = _Kept(400)
         self._truths: _Kept[Truth] = _Kept(400)
         self._suites: _Kept[BenchSuite] = _Kept(12)
+        self._own: _Kept[Scenario] = _Kept(60)
         self.lock = threading.RLock()
 
     def scenarios_of(self, bench: Bench) -> tuple[Scenario, ...]:
         """The suite with the bench's own scenarios, as `conformance contest --scenario` adds them:
         one of a name that is there takes its place."""
-        own = {s.name: s for s in own_scenarios(bench)}
+        with self.lock:
+            own = {s.name: s for s in own_scenarios(bench, self._read)}
         kept = [own.pop(s.name, s) for s in self.scenarios]
         return (*kept, *own.values())
+
+    def _read(self, text: str, source: str) -> Scenario:
+        """As `parse_own`, but a text that was read before is not read again: YAML is slow."""
+        return self._own.get(text, lambda: parse_own(text, source))
 
     def whole(self, bench: Bench) -> BenchSuite:
         """The bench's suite."""

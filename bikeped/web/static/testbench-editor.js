@@ -12,10 +12,11 @@ const round = (value, digits) => Math.round(value * 10 ** digits) / 10 ** digits
 // `change(script)` at every edit; `actions` = {save(), load(file), original(), add()}. Returns
 // {show(script, own), handles(), drag}.
 export function editor(host, change, actions) {
-  let script = null, chosen = [0, 0], built = "", keepSpeed = true;
+  let script = null, chosen = [0, 0], built = "", keepSpeed = true, nameField = null;
   const rows = [];
 
-  const emit = () => change(structuredClone(script));
+  // The page may give the changed scenario a name of its own.
+  const emit = () => { script.name = change(structuredClone(script)); };
   const handles = () => (script?.agents ?? []).flatMap((agent, a) => agent.path.map(([t, x, y], i) => (
     { a, i, t, x, y, role: ROLE[agent.kind] ?? "vehicle", chosen: chosen[0] === a && chosen[1] === i })));
 
@@ -49,6 +50,7 @@ export function editor(host, change, actions) {
   function sync() {
     const key = JSON.stringify(script.agents.map((agent) => [agent.id, agent.kind, agent.path.length]));
     if (key !== built) { build(); built = key; }
+    if (document.activeElement !== nameField) nameField.value = script.name;
     for (const { a, i, fields } of rows) {
       const path = script.agents[a].path;
       const values = [...path[i], i ? speedOf(path, i) : null];
@@ -60,6 +62,7 @@ export function editor(host, change, actions) {
     rows.length = 0;
     const name = el("input", { type: "text", value: script.name, maxlength: 120, "aria-label": "Name of the scenario" });
     name.addEventListener("change", () => { if (name.value.trim()) { script.name = name.value.trim(); emit(); } });
+    nameField = name;
     const pick = (label, values, key) => {
       const select = el("select", { "aria-label": label }, values.map((value) => el("option", { value, selected: script[key] === value }, value)));
       select.addEventListener("change", () => { script[key] = select.value; emit(); });

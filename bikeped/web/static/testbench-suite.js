@@ -33,7 +33,7 @@ function gates(data, changed) {
     el("th", { scope: "row" }, gate.name), el("td", { class: "number" }, gate.rule),
     changed ? el("td", { class: "number" }, mark(before.gates[i])) : null,
     el("td", { class: "number" }, mark(gate)));
-  return el("div", { class: "su-gates" },
+  return el("div", { class: "su-gates scroll", tabindex: 0, role: "region", "aria-label": "Gates" },
     el("p", { class: "su-verdict", "data-holds": after.promotable }, changed ? `With your changes the configuration ${verdict(after)}.` : `The configuration in force ${verdict(after)}.`),
     changed ? el("p", { class: "note" }, `Before, it ${before.promotable ? "held all gates" : `failed: ${before.gates.filter((g) => !g.holds).map((g) => g.name.toLowerCase()).join(", ")}`}.`) : null,
     el("table", {},
@@ -47,7 +47,7 @@ const mark = (gate) => el("span", { class: gate.holds ? "ok-mark" : "bad-mark" }
 function figures(data, changed, trials) {
   const cell = (side, key, say) => say(side.totals[key]);
   const head = ["Figure", ...(changed ? ["before", "after", "change"] : ["measured"]), ...(trials ? [`mean of ${trials.trials} trials`] : [])];
-  return el("div", { class: "su-figures scroll" }, el("table", {},
+  return el("div", { class: "su-figures scroll", tabindex: 0, role: "region", "aria-label": "Figures of the suite" }, el("table", {},
     el("caption", {}, "Figures over all frames of the suite"),
     el("thead", {}, el("tr", {}, head.map((text, i) => el("th", { scope: "col", class: i ? "number" : "" }, text)))),
     el("tbody", {}, FIGURES.map(([key, name, say, better]) => {
@@ -75,7 +75,7 @@ function repeat(data, changed, actions) {
       el("button", { type: "button", class: "small", onclick: actions.link }, "Copy link")) : null,
     el("label", { class: "button small" }, "Open a challenge", el("input", { type: "file", class: "unseen", id: "open-challenge", accept: ".json,application/json", onchange: actions.load })),
     changed ? el("div", {}, el("p", { class: "note" }, "The very same numbers on any computer:"),
-      el("pre", { tabindex: 0, "aria-label": "Command line" }, `bikeped testbench contest challenge.json${data.command ? `\n${data.command}` : ""}`)) : null);
+      el("pre", { tabindex: 0, "aria-label": "Command line" }, `${data.again}${data.command ? `\n${data.command}` : ""}`)) : null);
 }
 
 function word(value) {
@@ -104,7 +104,7 @@ function strips(data, changed, actions) {
     return row;
   });
   const order = changed ? [...rows].sort((a, b) => b.classList.contains("differs") - a.classList.contains("differs")) : rows;
-  return el("div", { class: "scroll" }, el("table", { class: "su-table" },
+  return el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Every scenario" }, el("table", { class: "su-table" },
     el("caption", {}, changed ? `${different.size} of ${data.strips.length} scenarios change. Each strip: danger above, states below, before (pale) over after.` : "Each strip: danger above, states below; the higher, the more urgent."),
     el("thead", {}, el("tr", {}, ["Scenario", "Over time", "Sensitivity", "Specificity", "Least budget"].map((text, i) => el("th", { scope: "col", class: i > 1 ? "number" : "" }, text)))),
     el("tbody", {}, order)));

@@ -10,27 +10,29 @@ import { suitePanel } from "/static/testbench-suite.js";
 import { configurationName } from "/static/testbench-words.js";
 
 const CLIENT = crypto.randomUUID?.().slice(0, 36) ?? String(Math.random());
-const app = { about: null, bench: null, play: null, own: new Map(), editing: false, sent: "" };
+const app = { about: null, bench: null, play: null, suite: null, own: new Map(), editing: false };
 let show, knobs, diagram, edits, suite;
 
 // --- asking: one request of a kind on its way, of those that wait only the newest
 
-function newest(path, take, begins = () => {}, ends = () => {}) {
-  let busy = false, next = null, turn = 0;
+function newest(kind, take, told) {
+  let busy = false, next = null;
+  const state = (word) => { $("#tb").dataset[kind] = word; if (told) setText(told, word === "busy" ? "computing …" : ""); };
   const send = async (job) => {
     busy = true;
-    begins();
-    const mine = ++turn;
+    state("busy");
     try {
-      const data = await request(path, { json: { bench: job.bench, client: CLIENT } });
-      if (mine === turn) take(data, job);
+      take(await request(`/testbench/${kind}`, { json: { bench: job.bench, client: CLIENT } }), job);
+      state("idle");
     } catch (error) {
-      if (error.status === 503) next ??= job;
-      else if (error.status !== 409) failed(error, path);
-      if (error.status === 503) await new Promise((wait) => setTimeout(wait, 1000));
+      state("failed");
+      if (error.status === 503) {
+        next ??= job;
+        await new Promise((wait) => setTimeout(wait, 1000));
+      } else if (error.status !== 409) failed(error);
     }
     busy = false;
-    if (next) { const job = next; next = null; send(job); } else ends();
+    if (next) { const job = next; next = null; send(job); }
   };
   return (bench) => {
     const job = { bench, began: performance.now() };
@@ -39,24 +41,22 @@ function newest(path, take, begins = () => {}, ends = () => {}) {
   };
 }
 
-function failed(error, path) {
-  edits?.fail(error.message);
-  if (!app.editing) toast(error.message, "bad");
-  setText($("#busy"), "not computed");
-  if (path.endsWith("suite")) setText($("#suite-busy"), "not computed");
+function failed(error) {
+  if (error.status === 400 && app.editing) edits.fail(error.message);
+  else toast(error.message, "bad");
 }
 
-const askScenario = newest("/testbench/scenario", (data, job) => {
+const askScenario = newest("scenario", (data, job) => {
   app.play = data;
-  app.shown = job.bench;
   edits.fail("");
-  if (job.bench.scenario && !job.bench.scenario.startsWith(" ")) edits.show(data.script);
+  if (job.bench === app.bench) edits.show(data.script);
   show.load(data);
   rememberLink(data.link);
+  document.documentElement.dataset.ready = "testbench";
   measured("bench:scenario", job);
-}, () => setText($("#busy"), "…"), () => setText($("#busy"), ""));
+}, $("#busy"));
 
-const askSuite = newest("/testbench/suite", (data, job) => {
+const askSuite = newest("suite", (data, job) => {
   app.suite = data;
   suite(data, null);
   setText($("#suite-title"), data.changes.length ? "Contest it: the whole suite, before and after" : "The whole suite");
@@ -64,9 +64,9 @@ const askSuite = newest("/testbench/suite", (data, job) => {
   const failing = data.after.gates.filter((gate) => !gate.holds).length;
   if (data.changes.length) announce(`Suite computed. ${failing ? `${failing} gates fail` : "All gates hold"}. ${data.changed.length} scenarios change.`);
   if (job.bench.perception.recall !== "all") askTrials(job.bench);
-}, () => setText($("#suite-busy"), "computing …"), () => setText($("#suite-busy"), ""));
+}, $("#suite-busy"));
 
-const askTrials = newest("/testbench/trials", (data, job) => {
+const askTrials = newest("trials", (data, job) => {
   if (app.suite && job.bench === app.bench) suite(app.suite, data.trials);
 });
 
@@ -109,6 +109,7 @@ function redraw(script) {
   for (const name of app.own.keys()) if (name === app.bench.scenario && name !== script.name) app.own.delete(name);
   app.own.set(script.name, script);
   change(withOwn({ ...app.bench, scenario: script.name }));
+  return script.name;
 }
 
 function freeName(name) {

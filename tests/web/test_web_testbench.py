@@ -1,0 +1,218 @@
+"""The test bench's numbers are the conformance commands' numbers, and its sentences the pole's."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+from aiohttp.test_utils import TestClient, TestServer
+from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
+
+from bikeped.config import DecisionConfig, rule_settings
+from bikeped.conformance.latency import sweep
+from bikeped.conformance.montecarlo import Plan, plan_trials, sorted_suite, summaries
+from bikeped.conformance.perception import RecallModel
+from bikeped.conformance.suite import CONFIGURATIONS, Suite, compare, compare_json
+from bikeped.decision import Decider
+from bikeped.types import State
+from bikeped.web.testbench_playback import TESTS, coverage, playback
+from bikeped.web.testbench_run import Workbench, trial_summaries
+from bikeped.web.testbench_settings import Pose
+
+
+@pytest.fixture(scope="module")
+def work():
+    return Workbench(LOADED, SCENARIOS)
+
+
+@pytest.fixture(scope="module")
+def suite():
+    return Suite.load(SCENARIOS, LOADED)
+
+
+@pytest.fixture(scope="module")
+def compared(suite):
+    # Through JSON and back, as a reader of the command's file gets it: repr is the last digit.
+    return json.loads(json.dumps(compare_json(suite, compare(suite), LOADED)))
+
+
+async def ask(client, path, asked, status=200):
+    answer = await client.post(f"/testbench/{path}", json={"bench": msgspec.to_builtins(asked)})
+    assert answer.status == status, await answer.text()
+    return await answer.json()
+
+
+async def test_every_scenario_under_every_rule_agrees_with_compare(compared):
+    names = list(CONFIGURATIONS)
+    async with TestClient(TestServer(pages())) as client:
+        for scenario in SCENARIOS:
+            for first in range(0, len(names), 3):
+                here = names[first : first + 3]
+                asked = msgspec.structs.replace(
+                    BASE,
+                    scenario=scenario.name,
+                    decision=CONFIGURATIONS[here[0]],
+                    beside=tuple(here[1:]),
+                )
+                play = await ask(client, "scenario", asked)
+                assert [side["name"] for side in play["sides"]] == here
+                for side in play["sides"]:
+                    told = compared["configurations"][side["name"]]["by_scenario"][scenario.name]
+                    assert side["metrics"] == told
+
+
+@pytest.mark.parametrize("error", [True, False])
+async def test_the_suite_agrees_with_compare(compared, error):
+    part = compared["configurations" if error else "without_localisation_error"]
+    async with TestClient(TestServer(pages())) as client:
+        for name, decision in CONFIGURATIONS.items():
+            asked = msgspec.structs.replace(
+                bench(perception={"localisation_error": error}), decision=decision
+            )
+            data = await ask(client, "suite", asked)
+            told = dict(part[name])
+            by_scenario = told.pop("by_scenario")
+            assert data["after"]["totals"] == told
+            for scenario, row in data["after"]["by_scenario"].items():
+                row.pop("states")
+                assert row == by_scenario[scenario]
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_latency_and_prediction_agree_with_the_sweep(work, suite, order):
+    data = sweep(suite, BASE.decision, (198,)).data
+    lists = data[("none", "first", "second")[order]]
+    one = work.whole(bench(delay={"delay_ms": 198.0, "order": order}))
+    figures = one.measure(BASE.decision).as_dict()
+    assert {key: [figures[key]] for key in lists} == lists
+
+
+@pytest.mark.parametrize(("recall", "mode"), [("size", "size"), ("kind", "flat")])
+def test_trials_agree_with_monte_carlo(work, suite, recall, mode):
+    asked = bench(
+        perception={"recall": recall, "burst_frames": 5.0, "seed": 3, "trials": 2},
+        delay={"delay_ms": 66.0, "order": 1},
+    )
+    plan = Plan(RecallModel(mode), 5.0, ((2, 1),))
+    found = plan_trials(sorted_suite(suite), plan, {"": BASE.decision}, range(2), 3)
+    assert trial_summaries(work.whole(asked), asked) == {
+        "trials": 2,
+        **summaries(found[2, 1][""]),
+    }
+
+
+def test_a_fixed_share_of_everybody_is_seen(work):
+    asked = bench("Bike Approaches Ped", perception={"recall": "fixed", "recall_value": 1.0})
+    all_seen = work.only(asked)
+    assert all_seen.scenes_seen[0].detected.tolist() == all_seen.seen[0].present.tolist()
+    half = work.only(
+        bench("Bike Approaches Ped", perception={"recall": "fixed", "recall_value": 0.5})
+    )
+    share = half.scenes_seen[0].detected.sum() / half.seen[0].present.sum()
+    assert 0.4 < share < 0.6
+    play = playback(half, 0, {"": BASE.decision})
+    assert sum(play["agents"][0]["missed"]) > 50
+
+
+@pytest.mark.parametrize("name", ["Swerving Cyclist", "Safe Crossing", "Multiple VRUs"])
+@pytest.mark.parametrize("rule", ["selected", "ttc", "distance_only", "narrow"])
+def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
+    decision = CONFIGURATIONS[rule]
+    one = work.only(bench(name))
+    play = playback(one, 0, {rule: decision})
+    side = play["sides"][0]
+    decider, rows = Decider(rule_settings(decision)), one.run.rows
+    for frame in range(play["frames"]):
+        at = rows.frame == frame
+        told = decider.step(frame / 30, rows.id[at], rows.kind[at], rows.xy_m[at])
+        assert side["sentence"][frame] == told.sentence
+        assert State(side["state"][frame]) is told.state
+        chosen = side["chosen"][frame]
+        pairs = side["pairs"]
+        if told.pair is None:
+            assert chosen == -1
+        else:
+            assert pairs["start"][frame] <= chosen < pairs["start"][frame + 1]
+            assert pairs["cyclist"][chosen] == told.pair.cyclist_id
+            assert pairs["pedestrian"][chosen] == told.pair.pedestrian_id
+            assert pairs["distance_m"][chosen] == pytest.approx(told.pair.distance_m, abs=6e-4)
+
+
+def test_a_pair_fires_when_all_its_tests_pass(work):
+    play = playback(work.only(bench("Multi-Speed Converging")), 0, {"": DecisionConfig()})
+    pairs = play["sides"][0]["pairs"]
+    bits = {test: 1 << i for i, test in enumerate(TESTS)}
+    fired = 0
+    for passes in pairs["passes"]:
+        every = all(passes & bits[t] for t in TESTS if t != "fires")
+        assert bool(passes & bits["fires"]) == every
+        fired += every
+    assert 0 < fired < len(pairs["passes"])
+
+
+def test_a_second_camera_sees_what_the_first_cannot(work):
+    asked = bench("Bike Approaches Ped", camera={"height_m": 2.0, "pitch_deg": -60.0})
+    both = msgspec.structs.replace(asked, second_camera=Pose(x_m=5.0, y_m=13.0, heading_deg=270.0))
+    one, two = work.only(asked), work.only(both)
+    lossy = bench(base=both, scenario=both.scenario, perception={"recall": "size"})
+    assert len(two.poses) == 2
+    assert (work.only(lossy).observed[0].recall >= 0.5).all()
+    assert not np.array_equal(one.observed[0].xy_m, two.observed[0].xy_m, equal_nan=True)
+
+
+def test_the_camera_is_hung_as_the_command_line_hangs_it(work):
+    from bikeped.config import ground_camera, load_config
+
+    by_hand = load_config(
+        overrides=("camera.height_m=5.5", "camera.pitch_deg=-30", "camera.fov_deg=150")
+    )
+    asked = bench("", camera={"height_m": 5.5, "pitch_deg": -30.0, "fov_deg": 150.0})
+    assert work.only(asked).camera == ground_camera(by_hand)
+
+
+def test_coverage_is_the_ground_that_the_camera_projects(work):
+    one = work.only(bench("", camera={"pitch_deg": -40.0, "fov_deg": 90.0}))
+    told = coverage(one.camera, one.pose)
+    far = np.asarray(told["far"], float).reshape(-1, 2)
+    near = np.asarray(told["near"], float).reshape(-1, 2)
+    some = ~np.isnan(far[:, 0])
+    assert 5 < some.sum() < 60
+    for edge in (near[some], far[some]):
+        assert one.camera.project(one.pose.world_to_ground(edge))[1].all()
+    middle = (near[some] + far[some]) / 2
+    assert one.camera.project(one.pose.world_to_ground(middle))[1].all()
+
+
+def test_own_scenarios_join_the_suite_or_take_a_place(work):
+    joined = msgspec.structs.replace(BASE, scripts=(OWN,), scenario="My crossing")
+    assert work.whole(joined).names[-1] == "My crossing"
+    assert work.only(joined).names == ("My crossing",)
+    instead = msgspec.structs.replace(
+        BASE, scripts=(OWN.replace("My crossing", "Safe Crossing"),), scenario="Safe Crossing"
+    )
+    assert len(work.whole(instead).names) == len(SCENARIOS)
+    assert len(work.only(instead).scenarios[0].agents) == 2
+
+
+def test_what_was_kept_is_not_mistaken_for_something_else(work):
+    """Asked in any order, a warm workbench answers as a fresh one."""
+    asked = [
+        BASE,
+        bench(danger={"cpa_radius_m": 3.0}),
+        bench(camera={"height_m": 6.0}),
+        bench(perception={"localisation_error": False}),
+        bench(perception={"recall": "size", "trial": 1}),
+        bench(perception={"recall": "size", "trial": 2}),
+        bench(delay={"delay_ms": 99.0}),
+        bench(camera={"x_m": 0.0}),
+    ]
+    few = [s for s in SCENARIOS if s.name == "Swerving Cyclist"]
+
+    def figures(workbench, one):
+        return repr(workbench.whole(one).measure(one.decision).as_dict())
+
+    fresh = [figures(Workbench(LOADED, few), one) for one in asked]
+    warm = Workbench(LOADED, few)
+    assert [figures(warm, one) for one in asked] == fresh
+    assert [figures(warm, one) for one in reversed(asked)] == fresh[::-1]
+    assert len(set(fresh)) >= 6
