@@ -10,7 +10,7 @@ import numpy as np
 from bikeped.calibration.adjust import Adjusted, adjust
 from bikeped.calibration.board_shape import alignment
 from bikeped.calibration.initial import FISHEYE, first_guess, picture_errors_px
-from bikeped.calibration.model import Model, Sightings, State
+from bikeped.calibration.model import Model, Sightings, State, angles, camera_points
 from bikeped.calibration.outliers import (
     FEWEST_CORNERS,
     LeftOut,
@@ -29,8 +29,10 @@ FEWEST_BOARDS = 3
 _ALIKE_SHARE = 0.1
 #: Corners that are off by more of a square than this make no board.
 _MOST_NOISE_SHARE = 0.1
-#: A fisheye lens sees at least this far from its axis, in the corner of its picture.
-_FISHEYE_FROM_DEG = 55.0
+#: A fisheye lens sees at least this far from its axis, in the corner of its picture ...
+_FISHEYE_FROM_DEG = 50.0
+#: ... and one that shows a corner as far out as this cannot be an ordinary lens.
+_ORDINARY_TO_DEG = 70.0
 #: How much better a perspective lens must explain the corners than every fisheye one.
 _CLEARLY = 0.8
 
@@ -160,6 +162,9 @@ def _differ(sightings: Sightings) -> None:
 
 def _is_fisheye(sightings: Sightings, state: State) -> None:
     """CalibrationError when an ordinary lens explains the corners, and sees no farther than one."""
+    farthest = angles(camera_points(state, sightings.flat))[sightings.seen].max()
+    if farthest > np.radians(_ORDINARY_TO_DEG):
+        return
     plain = [adjust(sightings, Model(name), state, robust=False) for name in FISHEYE]
     best = min(plain, key=lambda fitted: float((fitted.residuals_px**2).sum()))
     fisheye = float(np.sqrt((best.residuals_px**2).sum()))
@@ -167,19 +172,20 @@ def _is_fisheye(sightings: Sightings, state: State) -> None:
     size = np.array([sightings.width - 1, sightings.height - 1])
     rim = np.hypot(*np.maximum(centre, size - centre)) / best.state.lens[2]
     theta = float(np.degrees(inverse_curve(best.state.projection, np.asarray(rim))))
-    seen = np.hypot(*(sightings.uv_px[sightings.seen] - centre).T).max() / best.state.lens[2]
-    farthest = float(np.degrees(inverse_curve(best.state.projection, np.asarray(seen))))
-    if farthest > 70:  # beyond any ordinary lens
-        return
     ordinary = adjust(
         sightings, Model("perspective"), first_guess(sightings, ("perspective",)), robust=False
     )
     perspective = float(np.sqrt((ordinary.residuals_px**2).sum()))
     share = perspective / fisheye if fisheye > 0 else np.inf
-    if share < _CLEARLY or (theta < _FISHEYE_FROM_DEG and share < 1 / _CLEARLY):
-        raise CalibrationError(
-            "IMAGES: the lens is not a fisheye: an ordinary (perspective) one leaves "
-            f"{share:.2f} times the error of the best fisheye model ({best.model.name}), and the "
-            f"picture's corner is {theta:.0f} degrees from the axis; set camera.projection: "
-            "perspective, with camera.radius_px and camera.fov_deg, for an ordinary lens"
+    if share < _CLEARLY:
+        why = (
+            f"an ordinary (perspective) one leaves {share:.2f} times the error of the best fisheye"
         )
+    elif theta < _FISHEYE_FROM_DEG:
+        why = f"its picture ends {theta:.0f} degrees from the axis, in the corner"
+    else:
+        return
+    raise CalibrationError(
+        f"IMAGES: the lens is not a fisheye: {why}; for an ordinary lens set camera.projection: "
+        "perspective, with camera.radius_px and camera.fov_deg"
+    )
