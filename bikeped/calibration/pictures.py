@@ -1,0 +1,173 @@
+"""Pictures to calibrate from: files, folders and videos, one size, read when they are needed.
+
+A picture is kept as the bytes that it came in: forty 12-megapixel pictures decoded would take half
+a gigabyte.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bikeped.capture import VideoSource, read_size
+from bikeped.capture.images import JPEG_SUFFIXES, PICTURE_SUFFIXES, picture_paths
+from bikeped.capture.opencv import quiet
+from bikeped.errors import CalibrationError, CaptureError
+from bikeped.types import Frame, ImageArray
+
+#: A video is cut into pieces of this length, and the sharpest frame of each is looked at.
+VIDEO_PIECE_S = 0.5
+#: Not more than this many pieces of one video: they get longer instead.
+VIDEO_PIECES = 150
+_JUDGED_WIDTH = 640  # sharpness is compared on a picture of about this width
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture, encoded or grey. `moving`: a video's frame, whose neighbours look like it."""
+
+    name: str  #: for people: the file's path, or `clip.mp4 frame 120`
+    width: int
+    height: int
+    digest: str  #: SHA-256 of the file's (or the frame's) bytes
+    content: bytes | ImageArray
+    moving: bool = False
+
+    def grey(self) -> ImageArray:
+        """[height, width] grey levels, not turned by EXIF; CalibrationError for a broken file."""
+        if isinstance(self.content, np.ndarray):
+            return self.content
+        return decode_grey(self.content, self.name)
+
+
+def load_pictures(paths: Iterable[Path | str]) -> list[Picture]:
+    """Pictures, folders of pictures and videos as `Picture`s of one size, in the order given.
+
+    CalibrationError, naming the file and the mend: missing, unreadable, of another size than the
+    first, or none at all.
+    """
+    pictures: list[Picture] = []
+    for entry in paths:
+        pictures.extend(_load(Path(entry)))
+    if not pictures:
+        raise CalibrationError(
+            "no picture to calibrate from; name files, a folder of pictures or a video"
+        )
+    check_sizes(pictures)
+    return pictures
+
+
+def check_sizes(pictures: Sequence[Picture]) -> None:
+    """CalibrationError where a picture's size is not the first one's."""
+    first = pictures[0]
+    for picture in pictures:
+        if (picture.width, picture.height) != (first.width, first.height):
+            raise CalibrationError(
+                f"{picture.name}: is {picture.width}x{picture.height} pixels, but {first.name} is "
+                f"{first.width}x{first.height}; calibrate pictures of one size at a time"
+            )
+
+
+def pictures_hash(pictures: Sequence[Picture]) -> str:
+    """SHA-256 over the pictures' bytes in order of name, duplicates included."""
+    digest = hashlib.sha256()
+    for picture in sorted(pictures, key=lambda one: one.name):
+        digest.update(bytes.fromhex(picture.digest))
+    return digest.hexdigest()
+
+
+def decode_grey(content: bytes, name: str) -> ImageArray:
+    """[h, w] grey levels of an encoded picture; CalibrationError when it cannot be decoded."""
+    try:
+        with quiet():
+            data = np.frombuffer(content, np.uint8)
+            flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+            picture = cv2.imdecode(data, flags) if len(data) else None
+    except cv2.error as error:
+        raise CalibrationError(f"{name}: is no picture ({error.err}); remove it") from error
+    if picture is None:
+        raise CalibrationError(f"{name}: is no picture that can be decoded; remove it")
+    return np.asarray(picture, np.uint8)
+
+
+def _load(path: Path) -> list[Picture]:
+    if not path.exists():
+        raise CalibrationError(f"{path}: no such file or folder")
+    try:
+        files = picture_paths(path)
+        if path.is_dir() and not files:
+            raise CalibrationError(
+                f"{path}: holds no pictures ({', '.join(sorted(PICTURE_SUFFIXES))})"
+            )
+        if path.is_file() and path.suffix.lower() not in PICTURE_SUFFIXES:
+            return _video(path)
+        return [_picture(file) for file in files]
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _picture(path: Path) -> Picture:
+    content = path.read_bytes()
+    if path.suffix.lower() in JPEG_SUFFIXES:
+        try:
+            width, height = read_size(content)
+        except CaptureError as error:
+            raise CalibrationError(f"{path}: {error}; remove it") from error
+    else:
+        height, width = decode_grey(content, str(path)).shape
+    return Picture(str(path), width, height, hashlib.sha256(content).hexdigest(), content)
+
+
+def _video(path: Path) -> list[Picture]:
+    """The sharpest frame of every piece of a video."""
+    chosen: dict[int, tuple[float, Picture]] = {}
+    length_s = VIDEO_PIECE_S
+    try:
+        with VideoSource(path) as source:
+            while (frame := source.read()) is not None:
+                grey = frame_grey(frame, str(path))
+                score = sharpness(grey)
+                piece = int(frame.captured_s / length_s)
+                if piece not in chosen or score > chosen[piece][0]:
+                    chosen[piece] = score, _of_frame(frame, grey, path)
+                if len(chosen) > VIDEO_PIECES:
+                    length_s *= 2
+                    chosen = _halved(chosen)
+    except CaptureError as error:
+        raise CalibrationError(str(error)) from error
+    return [picture for _, (_, picture) in sorted(chosen.items(), key=lambda item: item[0])]
+
+
+def _halved(chosen: dict[int, tuple[float, Picture]]) -> dict[int, tuple[float, Picture]]:
+    out: dict[int, tuple[float, Picture]] = {}
+    for piece, (score, picture) in chosen.items():
+        if piece // 2 not in out or score > out[piece // 2][0]:
+            out[piece // 2] = score, picture
+    return out
+
+
+def _of_frame(frame: Frame, grey: ImageArray, path: Path) -> Picture:
+    content: bytes | ImageArray = bytes(frame.jpeg) if frame.jpeg is not None else grey
+    raw = content if isinstance(content, bytes) else content.tobytes()
+    name = f"{path} frame {frame.number}"
+    digest = hashlib.sha256(raw).hexdigest()
+    return Picture(name, grey.shape[1], grey.shape[0], digest, content, moving=True)
+
+
+def frame_grey(frame: Frame, name: str) -> ImageArray:
+    """[h, w] grey levels of a camera's or a recording's frame."""
+    if frame.rgb is not None:
+        return np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    return decode_grey(bytes(frame.jpeg or b""), f"{name} frame {frame.number}")
+
+
+def sharpness(grey: ImageArray) -> float:
+    """Compares frames of one scene only: the mean square of the Laplacian, larger is sharper."""
+    step = max(1, grey.shape[1] // _JUDGED_WIDTH)
+    small = cv2.resize(grey, (grey.shape[1] // step, grey.shape[0] // step), interpolation=3)
+    return float(np.square(cv2.Laplacian(small, cv2.CV_32F)).mean())
