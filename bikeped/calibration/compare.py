@@ -18,6 +18,7 @@ from bikeped.calibration.initial import FISHEYE
 from bikeped.calibration.model import PLAIN, Model, State, angles, camera_points, gain
 from bikeped.calibration.outliers import LeftOut
 from bikeped.calibration.prepare import Prepared
+from bikeped.calibration.threads import one_thread
 from bikeped.calibration.views import Refused
 from bikeped.errors import CalibrationError
 from bikeped.geometry.lens import Projection, curve
@@ -73,6 +74,7 @@ def models_to_compare(chosen: Model) -> list[Model]:
     return list(dict.fromkeys([*models, chosen]))
 
 
+@one_thread
 def calibrate(
     prepared: Prepared,
     models: Sequence[Model],

@@ -14,6 +14,7 @@ import numpy as np
 from bikeped.calibration.adjust import Adjusted, Linear, readjust
 from bikeped.calibration.jacobian import jacobian
 from bikeped.calibration.model import Sightings, State, residuals, rotations
+from bikeped.calibration.threads import one_thread
 from bikeped.types import FloatArray, IntArray
 
 #: Fewer pictures than this are fitted anew for every fold; with more, one step is as good.
@@ -28,6 +29,7 @@ def folds_of(pictures: int, folds: int) -> IntArray:
     return np.arange(pictures) % min(folds or pictures, pictures)
 
 
+@one_thread
 def held_out_residuals(fitted: Adjusted, sightings: Sightings, folds: int) -> FloatArray:
     """[V, C, 2] residuals of each picture under the lens that the other folds give, pixels."""
     fold = folds_of(len(sightings), folds)

@@ -6,6 +6,7 @@ import datetime
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -182,26 +183,7 @@ def test_the_page_is_whole_by_itself(done: Calibrated) -> None:
     assert page.count("data:image/png;base64,") >= 4
     assert "mind &lt;this&gt;" in page
     assert "&lt;b&gt;x.jpg" in page
+    assert "corner 7: 31.4 px off" in page
     assert "same picture as a &amp; b" in page
     assert f"{chosen.cross_validated_px:.3f} px" in page
     assert re.search(r"<td>k2</td><td>-0\.0\d+", page)
-
-
-def test_the_page_names_corners_that_were_left_out(done: Calibrated) -> None:
-    from dataclasses import replace
-
-    prepared = replace(done.prepared, left_out=(LeftOut("c.jpg", 7, 31.4),))
-    page = report_page(
-        Told(
-            replace(done, prepared=prepared),
-            done.fits["equidistant"],
-            recommend(done),
-            the_field(done, "equidistant"),
-            [],
-            [],
-            [],
-        ),
-        [],
-    )
-    assert "c.jpg" in page
-    assert "corner 7: 31.4 px off" in page
