@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: Classes whose box holds a cycle and who rides it; COCO's `bicycle` is the cycle alone.
+WITH_RIDER = frozenset({"cyclist", "bicyclist", "motorcyclist", "rider"})
 UNMAPPED = -1  #: in a kind table: a class that the decision does not know
 
 _COCO = (
@@ -81,6 +83,15 @@ def kind_table(names: tuple[str, ...], config: DetectionConfig, source: str) -> 
     for label in missing:
         log.warning("%s: no class of the model is a %s (detection.%s)", source, label, label)
     return table
+
+
+def riders_are_whole(names: tuple[str, ...], kinds: KindArray) -> bool:
+    """Whether every class that is a cyclist, by `kind_table`'s `kinds`, boxes the rider, too.
+
+    Of such a model nobody is to be joined to a cycle, and a person is either on one or not.
+    """
+    mine = [name for name, kind in zip(names, kinds.tolist(), strict=True) if kind == Kind.CYCLIST]
+    return bool(mine) and all(_plain(name) in WITH_RIDER for name in mine)
 
 
 def _plain(name: str) -> str:

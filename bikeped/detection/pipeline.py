@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.detection.base import DetectorAnswer
-from bikeped.detection.classes import UNMAPPED, class_names, kind_table
+from bikeped.detection.classes import UNMAPPED, class_names, kind_table, riders_are_whole
 from bikeped.detection.facts import ModelMetadata
 from bikeped.detection.halves import drop_halves
 from bikeped.detection.layouts import Candidates, Layout, choose_layout, decode, pick_output
@@ -24,7 +24,7 @@ from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.detection.riders import join_riders
 from bikeped.detection.weights import first_layer
 from bikeped.errors import DetectorError
-from bikeped.types import Detections, Float32Array, ImageArray, Kind
+from bikeped.types import Detections, Float32Array, ImageArray, IntArray, Kind, KindArray
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -88,7 +88,9 @@ class NetworkDetector:
         self.class_names: tuple[str, ...] = names  #: of the network's own classes, by their number
         self._kind_of_class = kind_table(names, config, self._source)
         self._wanted = self._kind_of_class != UNMAPPED
-        faint = RIDDEN_SHARE if config.rider_overlap < 1 else 1.0
+        self._whole = riders_are_whole(names, self._kind_of_class)
+        self._rider_overlap = 1.0 if self._whole else config.rider_overlap
+        faint = RIDDEN_SHARE if self._rider_overlap < 1 else 1.0
         self._least = np.where(
             self._kind_of_class == Kind.CYCLIST, config.confidence * faint, config.confidence
         ).astype(np.float32)
@@ -196,22 +198,22 @@ class NetworkDetector:
         # whatever their class: a car that is also a truck is one vehicle.
         on_frame = np.nonzero((box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1]))[0]
         kind, score, box = kind[on_frame], score[on_frame], box[on_frame]
-        keep = suppress(box, score, kind, self._config.iou, self._config.max_detections)
+        keep = self._suppress(box, score, kind)
         joined = join_riders(
             drop_halves(Detections(kind[keep], score[keep], box[keep])),
-            self._config.rider_overlap,
+            self._rider_overlap,
             self._config.confidence,
         )
         # Joining makes boxes grow: two sights of one cyclist may only now lie on one another.
-        return joined.take(
-            suppress(
-                joined.box_px,
-                joined.confidence,
-                joined.kind,
-                self._config.iou,
-                self._config.max_detections,
-            )
-        )
+        return joined.take(self._suppress(joined.box_px, joined.confidence, joined.kind))
+
+    def _suppress(self, box: Float32Array, score: Float32Array, kind: KindArray) -> IntArray:
+        """Which boxes stay: one for each object of a kind.
+
+        Where a cyclist's box holds the rider, one person boxed as both is the likelier of the two.
+        """
+        group = np.where(kind == Kind.CYCLIST, Kind.PEDESTRIAN, kind) if self._whole else kind
+        return suppress(box, score, group, self._config.iou, self._config.max_detections)
 
 
 def _on_frame(box: Float32Array, where: Letterbox) -> Float32Array:

@@ -57,6 +57,7 @@ class Sight:
     found: bool
     confidence: float  #: 0 where not found
     error_m: float  #: of the box's bottom centre on the ground; NaN where not found or no ground
+    on_other: bool = False  #: a detection that is somebody, but of another kind
 
 
 def drawn_test(
@@ -85,22 +86,30 @@ def summary(seen: Sequence[Sequence[Sight]], confidence: float) -> dict[str, Any
             {"from_m": low, "to_m": high, **_numbers(mine, low, high, confidence)}
             for low, high in pairwise(RINGS_M)
         ]
-        false = sum(
-            s.kind == kind and np.isnan(s.distance_m) and s.confidence >= confidence for s in rows
-        )
+        extra = [
+            s.on_other
+            for s in rows
+            if s.kind == kind and np.isnan(s.distance_m) and s.confidence >= confidence
+        ]
         result["kinds"][kind.label] = {
             "within_15_m": _numbers(mine, 0, NEAR_M, confidence),
             "rings": rings,
-            "false_per_100_frames": round(100 * false / max(1, len(seen)), 3),
+            "false_per_100_frames": _a_hundred(extra.count(False), seen),
+            "another_kind_per_100_frames": _a_hundred(extra.count(True), seen),
         }
-    result["false_pedestrian_or_cyclist_per_100_frames"] = round(
-        sum(
-            result["kinds"][k.label]["false_per_100_frames"]
-            for k in (Kind.PEDESTRIAN, Kind.CYCLIST)
-        ),
-        3,
-    )
+    for what in ("false", "another_kind"):
+        result[f"{what}_pedestrian_or_cyclist_per_100_frames"] = round(
+            sum(
+                result["kinds"][k.label][f"{what}_per_100_frames"]
+                for k in (Kind.PEDESTRIAN, Kind.CYCLIST)
+            ),
+            3,
+        )
     return result
+
+
+def _a_hundred(count: int, seen: Sequence[Sequence[Sight]]) -> float:
+    return round(100 * count / max(1, len(seen)), 3)
 
 
 def sweep(seen: Sequence[Sequence[Sight]], confidences: Sequence[float]) -> list[dict[str, float]]:
@@ -112,6 +121,9 @@ def sweep(seen: Sequence[Sequence[Sight]], confidences: Sequence[float]) -> list
             {
                 "confidence": confidence,
                 "false_per_100_frames": numbers["false_pedestrian_or_cyclist_per_100_frames"],
+                "another_kind_per_100_frames": numbers[
+                    "another_kind_pedestrian_or_cyclist_per_100_frames"
+                ],
                 **{
                     kind.label: numbers["kinds"][kind.label]["within_15_m"]["recall"]
                     for kind in (Kind.PEDESTRIAN, Kind.CYCLIST)
@@ -178,7 +190,8 @@ def judge_picture(
     """Greedy by confidence, kind for kind, at an overlap of at least `MATCH_IOU`.
 
     A detection on somebody who is hardly visible, tiny or very far, of whatever kind, is neither
-    right nor wrong.
+    right nor wrong. One on somebody of another kind is told from one on nobody; the second one on
+    the same person counts as nobody.
     """
     least = LEAST_SIDE_PX * view.size[0] / 960
     box = np.array([o.box_px for o in objects], np.float64).reshape(-1, 4)
@@ -203,8 +216,9 @@ def judge_picture(
         if fits:
             taken[int(max(fits)[1])] = d
         elif not (overlap[d] * ~asked >= MATCH_IOU / 2).any():
+            other = bool(((overlap[d] >= MATCH_IOU) & (kind != found.kind[d]) & asked).any())
             label = Kind(int(found.kind[d]))
-            rows.append(Sight(label, np.nan, False, float(found.confidence[d]), np.nan))
+            rows.append(Sight(label, np.nan, False, float(found.confidence[d]), np.nan, other))
     ground, valid = _ground(found, view)
     for o in np.nonzero(asked)[0].tolist():
         item, d = objects[o], taken.get(o, -1)

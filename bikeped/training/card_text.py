@@ -92,8 +92,10 @@ def card_text(card: Mapping[str, Any]) -> str:
 def _measured(title: str, test: Mapping[str, Any]) -> str:
     false = test["false_pedestrian_or_cyclist_per_100_frames"]
     cars = test["kinds"]["vehicle"]["false_per_100_frames"]
-    said = f"{test['frames']} frames from seed {test['seed']}; {false:g} false pedestrians or "
-    said += f"cyclists a 100 frames, {cars:g} false vehicles."
+    other = test["another_kind_pedestrian_or_cyclist_per_100_frames"]
+    said = f"{test['frames']} frames from seed {test['seed']}. A 100 frames have {false:g} false "
+    said += f"pedestrians or cyclists, {cars:g} false vehicles, and {other:g} pedestrians or "
+    said += "cyclists that are road users of another kind."
     lines = [f"### {title}", "", said]
     for kind in Kind:
         numbers = test["kinds"][kind.label]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.config.sections import DetectionConfig
+from bikeped.detection.classes import WITH_RIDER
 from bikeped.detection.riders import join_riders
 from bikeped.training.coco import CocoData, CocoImage, CocoObject
 from bikeped.training.measures import Truth
@@ -19,8 +20,6 @@ from bikeped.types import Detections, Kind
 
 #: Side of the network input that areas are measured at (definitions, section 3).
 INPUT_PX = 1280
-#: Classes whose box holds the cycle alone; any other cyclist's box holds the rider, too.
-BARE_CYCLES = frozenset({"bicycle", "motorcycle"})
 
 
 def kinds_by_name(names: Mapping[int, str], detection: DetectionConfig) -> dict[int, Kind]:
@@ -50,9 +49,11 @@ def truth_of(data: CocoData, group_of: Mapping[int, int]) -> Truth:
 def joined_truth(data: CocoData, kind_of: Mapping[int, Kind], detection: DetectionConfig) -> Truth:
     """The data's road users as the deployed detector means them: riders joined to their cycles."""
     rows = _Rows()
-    bare = {i for i, name in data.categories.items() if plain_name(name) in BARE_CYCLES} & set(
-        kind_of
-    )
+    bare = {
+        i
+        for i, kind in kind_of.items()
+        if kind is Kind.CYCLIST and plain_name(data.categories[i]) not in WITH_RIDER
+    }
     people = {i for i, kind in kind_of.items() if kind is Kind.PEDESTRIAN}
     for number, picture in enumerate(data.images):
         things = [t for t in data.objects[picture.id] if t.category_id in kind_of]

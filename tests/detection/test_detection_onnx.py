@@ -199,6 +199,36 @@ def test_a_car_that_is_also_a_truck_is_one_vehicle(tmp_path):
     assert found.confidence == pytest.approx([0.7])
 
 
+@pytest.mark.parametrize(
+    ("names", "kinds"),
+    [
+        ("{0: 'person', 1: 'bicycle', 2: 'tree'}", [Kind.CYCLIST]),  # joined: a rider
+        ("{0: 'person', 1: 'cyclist', 2: 'tree'}", [Kind.PEDESTRIAN]),  # one person, the likelier
+    ],
+)
+def test_a_person_boxed_as_walker_and_as_rider_is_one_of_them(tmp_path, names, kinds):
+    out = answer_of("yolov8")
+    out[0, :4, 18] = PERSON
+    out[0, 5, 18] = 0.5
+    model = save(tmp_path / "model.onnx", out, {"names": names})
+    found = load(model).infer(grey(), *FRAME).detections
+    assert found.kind.tolist() == kinds
+    assert found.confidence.tolist() == [pytest.approx(0.9)]
+
+
+def test_a_walker_in_front_of_a_boxed_rider_stays_a_walker(tmp_path):
+    out = answer_of("yolov8")
+    cx, cy, w, h = PERSON
+    out[0, :4, 18] = cx, cy - h / 4, 2.4 * w, h  # would be a cycle under the person
+    out[0, 5, 18] = 0.5
+    meta = {"names": "{0: 'pedestrian', 1: 'cyclist', 2: 'tree'}"}
+    found = load(save(tmp_path / "model.onnx", out, meta)).infer(grey(), *FRAME).detections
+    assert found.kind.tolist() == [Kind.PEDESTRIAN, Kind.CYCLIST]
+    meta = {"names": "{0: 'pedestrian', 1: 'bicycle', 2: 'tree'}"}
+    found = load(save(tmp_path / "other.onnx", out, meta)).infer(grey(), *FRAME).detections
+    assert found.kind.tolist() == [Kind.CYCLIST]
+
+
 def test_a_flood_of_boxes_is_bounded_and_answers_the_strongest(tmp_path):
     rng = np.random.default_rng(0)
     out = np.zeros((1, 7, CELLS), np.float32)

@@ -65,8 +65,12 @@ def test_misses_wrong_kinds_and_doubles(view):
     rows = judge_picture(found((CYC, 0.9, BOX)), [thing(BOX)], view)
     assert [(s.kind, s.found) for s in rows] == [(CYC, False), (PED, False)]
     assert math.isnan(rows[0].distance_m)
+    assert rows[0].on_other
+    (nobody, _) = judge_picture(found((CYC, 0.9, (10, 300, 30, 350))), [thing(BOX)], view)
+    assert not nobody.on_other
     rows = judge_picture(found((PED, 0.9, BOX), (PED, 0.8, BOX)), [thing(BOX)], view)
     assert [(s.found, math.isnan(s.distance_m)) for s in rows] == [(False, True), (True, False)]
+    assert not rows[0].on_other
 
 
 def test_nobody_is_asked_for_who_cannot_be_seen(view):
@@ -84,7 +88,12 @@ def sights():
     far = [Sight(PED, 18.0, False, 0.0, NAN), Sight(CYC, 3.0, True, 0.9, NAN)]
     return [
         near,
-        [*far, Sight(CYC, NAN, False, 0.3, NAN), Sight(Kind.VEHICLE, NAN, False, 0.9, NAN)],
+        [
+            *far,
+            Sight(CYC, NAN, False, 0.3, NAN),
+            Sight(Kind.VEHICLE, NAN, False, 0.9, NAN),
+            Sight(PED, NAN, False, 0.9, NAN, True),
+        ],
     ]
 
 
@@ -101,6 +110,8 @@ def test_the_summary_counts_at_a_confidence():
     assert numbers["kinds"]["cyclist"]["false_per_100_frames"] == 50
     assert numbers["kinds"]["cyclist"]["within_15_m"]["median_error_m"] is None
     assert numbers["false_pedestrian_or_cyclist_per_100_frames"] == 50
+    assert walkers["another_kind_per_100_frames"] == 50
+    assert numbers["another_kind_pedestrian_or_cyclist_per_100_frames"] == 50
     assert summary(sights(), 0.35)["false_pedestrian_or_cyclist_per_100_frames"] == 0
     assert summary(sights(), 0.1)["kinds"]["pedestrian"]["within_15_m"]["recall"] == 1
 
