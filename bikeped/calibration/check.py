@@ -21,7 +21,7 @@ from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
 
 _ROUGH = 0.3  # squares: a candidate's corner further off its neighbours' expectation is wrong ...
 _FINE_PX = 1.5  # ... and a refined one further than this ...
-_FINE = 0.06  # ... plus this share of a square
+_FINE = (0.06, 0.1, 0.2)  # ... plus this share of a square: inside, at an edge, at a board's corner
 _REPAIRABLE = 0.15  # of the corners
 _KEPT = 0.7  # of the corners must be good in the end
 _CROSSES = 0.15  # `crossing` of a corner that can be seen
@@ -50,9 +50,10 @@ def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> C
     refined = refine(grey, seen, uv)
     good, expected = _good(grey, seen, refined)
     if not good.all() and good.mean() > 0.5:
-        again = np.where(good[:, None], refined.uv_px, expected)
-        refined = refine(grey, seen, again)
-        good, _ = _good(grey, seen, refined)
+        again = refine(grey, seen, np.where(good[:, None], refined.uv_px, expected))
+        better, _ = _good(grey, seen, again)
+        if better.sum() > good.sum():
+            refined, good = again, better
     if good.mean() < _KEPT:
         return f"only {int(good.sum())} of {pattern.count} corners can be seen clearly"
     wrong = _goes_on(grey, pattern, seen, refined.uv_px)
@@ -132,11 +133,17 @@ def _good(grey: ImageArray, seen: FloatArray, refined: Refined) -> tuple[BoolArr
     near = local_map(seen, seen, refined.uv_px)
     spacing = near.spacing_px.min(1)
     off, expected = misfit(seen, refined.uv_px)
-    fit = fits(refined, spacing) & (off * spacing < _FINE_PX + _FINE * spacing)
+    # At an edge the others can only be continued, and a board's corner lies off both ways.
+    share = np.array(_FINE)[_edges_touched(seen)]
+    fit = fits(refined, spacing) & (off * spacing < _FINE_PX + share * spacing)
     colour = crossing(grey, near) * np.where(seen.sum(1) % 2 == 0, 1.0, -1.0)
     if np.median(colour) < 0:
         colour = -colour
     return np.asarray(fit & (colour > _CROSSES)), expected
+
+
+def _edges_touched(seen: FloatArray) -> IntArray:
+    return np.asarray(((seen == seen.min(0)) | (seen == seen.max(0))).sum(1), np.int64)
 
 
 def _goes_on(grey: ImageArray, pattern: BoardPattern, seen: FloatArray, uv: FloatArray) -> str:

@@ -131,4 +131,4 @@ def crossing(grey: ImageArray, near: LocalMap) -> FloatArray:
     other = np.minimum(level[:, 0], level[:, 3]) - np.maximum(level[:, 1], level[:, 2])
     spread = np.maximum(np.nanmax(level, 1, initial=-1) - np.nanmin(level, 1, initial=256), 8.0)
     score = np.where(same > 0, same, np.where(other > 0, -other, 0.0)) / spread
-    return np.nan_to_num(score, nan=0.0)
+    return np.asarray(np.nan_to_num(score, nan=0.0))
