@@ -168,9 +168,16 @@ def test_the_page_is_whole_by_itself(done: Calibrated) -> None:
     chosen = done.fits["equidistant+k2+board"]
     views = done.prepared.sightings.names
     gray = np.random.default_rng(1).integers(0, 255, (2160, 3840), dtype=np.uint8)
+    prepared = replace(done.prepared, left_out=(LeftOut("c.jpg", 7, 31.4),))
     page = report_page(
         Told(
-            done, chosen, told, the_field(done), ["mind <this>"], ["upper left"], [(1, 1.5, 0, 1)]
+            replace(done, prepared=prepared),
+            chosen,
+            told,
+            the_field(done),
+            ["mind <this>"],
+            ["upper left"],
+            [(1, 1.5, 0, 1)],
         ),
         [Thumbnail(name, gray, FRAMING.offset_px) for name in views],
     )
