@@ -1,9 +1,10 @@
 """`/testbench`: the simulation behind a page. The page draws; every number is computed here, by the
 deployed rule and the conformance code.
 
-Requests are JSON: a whole `Bench` and, to order them, the page's own number. One answer is computed
-at a time, in a thread; of a page's waiting requests only the newest is answered (the others get
-status 409), and of many pages' only so many wait (503).
+Requests are JSON: a whole `Bench` and the page's own name. Of each kind (a scenario, the suite, its
+trials) one answer is computed at a time, in a thread, so that a slider does not wait for the suite;
+of a page's waiting requests only the newest is answered (the others get status 409), and of many
+pages' only so many wait (503).
 """
 
 from __future__ import annotations
@@ -73,7 +74,9 @@ def add_testbench(
     origin: Origin = Origin(),  # noqa: B008 - immutable
 ) -> None:
     """Adds the page and its API; `loaded` is the configuration in force, `scenarios` the suite."""
-    work, desk = Workbench(loaded, scenarios), Desk()
+    # One for the scenario shown and one for the suite: neither waits for what the other keeps.
+    shown, work = Workbench(loaded, scenarios), Workbench(loaded, scenarios)
+    desks = {kind: Desk() for kind in ("scenario", "suite", "trials")}
     named = configurations(loaded)
     about = msgspec.json.encode(describe(work, named))
 
@@ -83,14 +86,14 @@ def add_testbench(
     async def ask(request: web.Request, answer: Callable[[Ask], Any]) -> web.Response:
         found = await json_body(request, Ask)
         check_bench(found.bench)
-        kind = request.path.rsplit("/", 1)[-1]
-        body = await desk.ask(f"{found.client} {kind}", lambda: msgspec.json.encode(answer(found)))
+        desk = desks[request.path.rsplit("/", 1)[-1]]
+        body = await desk.ask(found.client, lambda: msgspec.json.encode(answer(found)))
         return web.Response(
             body=body, content_type="application/json", headers={"Cache-Control": "no-store"}
         )
 
     async def scenario(request: web.Request) -> web.Response:
-        return await ask(request, lambda found: scenario_answer(work, found, named))
+        return await ask(request, lambda found: scenario_answer(shown, found, named))
 
     async def suite(request: web.Request) -> web.Response:
         return await ask(request, lambda found: contest_answer(work, found.bench, origin))

@@ -137,7 +137,7 @@ def test_of_many_quick_changes_the_last_one_holds(testbench):
 
 
 def test_every_knob_gives_an_answer(testbench):
-    page = testbench("scenario=Cyclist%20Abort")
+    page = testbench("scenario=Cyclist%20Abort&perception.trials=2")
     page.locator(".kn-group").evaluate_all("all => all.forEach(d => { d.open = true })")
     page.get_by_label("who is seen", exact=True).select_option("0")
     page.get_by_label("who is seen", exact=True).select_option(label="a share, set below")

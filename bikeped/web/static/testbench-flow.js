@@ -31,10 +31,11 @@ export function flow(host) {
     const here = play.agents.filter((agent) => agent.true[2 * frame] !== null);
     const missed = play.agents.filter((agent) => agent.missed[frame]);
     const found = play.agents.filter((agent) => agent.detected[2 * frame] !== null);
-    const late = play.delay_frames ? `, a picture ${Math.round(1000 * play.delay_frames / play.fps)} ms old` : "";
+    const late = play.delay_frames ? `, ${Math.round(1000 * play.delay_frames / play.fps)} ms ago` : "";
     perception.show(`${found.length} of ${here.length} seen${missed.length ? `, ${COUNT(missed.length, "miss", "misses")}` : ""}${late}`, missed.length > 0);
     const errors = found.map((agent) => agent.error_m[frame]).filter((value) => value !== null);
-    place.show(errors.length ? `places off by ${errors.map((e) => e.toFixed(2)).slice(0, 4).join(", ")}${errors.length > 4 ? " …" : ""} m` : "nobody to place");
+    const [least, most] = [Math.min(...errors), Math.max(...errors)].map((e) => e.toFixed(2));
+    place.show(!errors.length ? "nobody to place" : least === most ? `places off by ${most} m` : `places off by ${least} to ${most} m`);
     const coasting = tracks.length - found.length;
     tracker.show(tracks.length ? `${COUNT(tracks.length, "track", "tracks")}${coasting > 0 ? `, ${coasting} unseen and carried on` : ""}` : "no tracks", coasting > 0);
     prediction.show(play.order && play.delay_frames ? `${play.delay_frames} frames ahead by ${play.order === 1 ? "velocity" : "velocity and acceleration"}` : "none");

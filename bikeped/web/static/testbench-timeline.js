@@ -150,7 +150,7 @@ function drawOnsets(context, x, y, side, play, ink) {
     context.lineTo(at - 5, y - 6);
     context.lineTo(at + 5, y - 6);
     context.fill();
-    if (onset.budget_s === null || !onset.danger) continue;
+    if (onset.budget_s === null) continue;
     const end = x(onset.frame + onset.budget_s * play.fps);
     const enough = onset.budget_s > play.prt_s.distracted;
     const tone = enough ? ink : colour("--danger");

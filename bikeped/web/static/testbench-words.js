@@ -11,7 +11,7 @@ export const TIERS = ["none", "actionable", "imminent"];
 export function configurationName(name, short = false) {
   const words = {
     bench: ["your numbers", "The bench’s numbers"], configured: ["in force", "In force on this box"],
-    selected: ["selected", "Selected (the paper’s)"], conservative: ["conservative", "Conservative"],
+    selected: ["selected", "Selected (paper)"], conservative: ["conservative", "Conservative"],
     narrow: ["narrow", "Narrow"], speed_adaptive: ["speed-adaptive", "Speed-adaptive"],
     distance_only: ["distance only", "Distance only"], naive_closing: ["naive closing", "Naive closing"],
     ttc: ["time to collision", "Time to collision"],

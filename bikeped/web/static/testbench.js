@@ -11,7 +11,8 @@ import { configurationName } from "/static/testbench-words.js";
 
 const CLIENT = crypto.randomUUID?.().slice(0, 36) ?? String(Math.random());
 const app = { about: null, bench: null, play: null, suite: null, own: new Map(), editing: false };
-let show, knobs, diagram, edits, suite;
+const REST_MS = 120;
+let show, knobs, diagram, edits, suite, resting = 0;
 
 // --- asking: one request of a kind on its way, of those that wait only the newest
 
@@ -23,7 +24,7 @@ function newest(kind, take, told) {
     state("busy");
     try {
       take(await request(`/testbench/${kind}`, { json: { bench: job.bench, client: CLIENT } }), job);
-      state("idle");
+      if (kind !== "suite" || (!next && job.bench === app.wanted)) state("idle");
     } catch (error) {
       state("failed");
       if (error.status === 503) {
@@ -34,8 +35,8 @@ function newest(kind, take, told) {
     busy = false;
     if (next) { const job = next; next = null; send(job); }
   };
-  return (bench) => {
-    const job = { bench, began: performance.now() };
+  return (bench, began = performance.now()) => {
+    const job = { bench, began };
     if (busy) next = job;
     else send(job);
   };
@@ -67,7 +68,7 @@ const askSuite = newest("suite", (data, job) => {
 }, $("#suite-busy"));
 
 const askTrials = newest("trials", (data, job) => {
-  if (app.suite && job.bench === app.bench) suite(app.suite, data.trials);
+  if (app.suite && job.bench === app.wanted) suite(app.suite, data.trials);
 });
 
 // From the change to the frame that shows it; scripts/bench reads these.
@@ -89,7 +90,13 @@ function change(bench, { scenarioOnly = false } = {}) {
   knobs(bench, app.about.base);
   showPicks();
   askScenario(bench);
-  if (!scenarioOnly) askSuite(bench);
+  if (scenarioOnly) return;
+  // The suite follows when the hand rests.
+  const began = performance.now();
+  app.wanted = bench;
+  clearTimeout(resting);
+  $("#tb").dataset.suite = "waiting";
+  resting = setTimeout(() => askSuite(bench, began), REST_MS);
 }
 
 function choose(name) {
