@@ -21,7 +21,7 @@ from bikeped.capture.jpeg import JpegDecoder
 from bikeped.config import LoadedConfig
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import Detector, load_detector
-from bikeped.scene import DrawnObject, SceneCamera, pictures, scene_camera
+from bikeped.scene import Conditions, DrawnObject, SceneCamera, pictures, scene_camera
 from bikeped.scene.clip import encode_jpeg
 from bikeped.types import Detections, FloatArray, Kind
 
@@ -65,15 +65,39 @@ def drawn_test(
     loaded: LoadedConfig,
     test: DrawnTest,
     progress: Callable[[int], None] = lambda done: None,
-) -> list[list[Sight]]:
-    """What the model made of every picture. `model.model` is an absolute path."""
+) -> tuple[list[list[Sight]], list[str]]:
+    """What the model made of every picture, and the picture's light and weather.
+
+    `model.model` is an absolute path.
+    """
     detector = load_detector(model, Path("/"))
-    seen = []
-    for jpeg, objects, view in _drawn(loaded, test):
+    seen, lights = [], []
+    for jpeg, objects, view, conditions in _drawn(loaded, test):
         found = _look(detector, jpeg, view)
         seen.append(judge_picture(found, objects, view))
+        lights.append("rain" if conditions.weather == "rain" else conditions.light)
         progress(len(seen))
-    return seen
+    return seen, lights
+
+
+def by_light(
+    seen: Sequence[Sequence[Sight]], lights: Sequence[str], confidence: float
+) -> dict[str, dict[str, Any]]:
+    """For every light (rain by itself): frames, recall within 15 m by kind, false a 100 frames."""
+    rows: dict[str, dict[str, Any]] = {}
+    for light in sorted(set(lights)):
+        numbers = summary(
+            [s for s, it in zip(seen, lights, strict=True) if it == light], confidence
+        )
+        rows[light] = {
+            "frames": numbers["frames"],
+            "false_per_100_frames": numbers["false_pedestrian_or_cyclist_per_100_frames"],
+            **{
+                kind.label: numbers["kinds"][kind.label]["within_15_m"]["recall"]
+                for kind in (Kind.PEDESTRIAN, Kind.CYCLIST)
+            },
+        }
+    return rows
 
 
 def summary(seen: Sequence[Sequence[Sight]], confidence: float) -> dict[str, Any]:
@@ -134,13 +158,14 @@ def sweep(seen: Sequence[Sequence[Sight]], confidences: Sequence[float]) -> list
 
 
 def choose_confidence(
-    seen: Sequence[Sequence[Sight]], grid: Sequence[float], most_false: float
+    seen: Sequence[Sequence[Sight]], kind: Kind, grid: Sequence[float], most_false: float
 ) -> float:
-    """The lowest confidence of `grid` with at most `most_false` false pedestrians and cyclists a
-    100 frames; the highest of `grid` where there is none."""
-    for row in sweep(seen, sorted(grid)):
-        if row["false_per_100_frames"] <= most_false:
-            return float(row["confidence"])
+    """The lowest confidence of `grid` with at most `most_false` false ones of `kind` a 100 frames;
+    the highest of `grid` where there is none."""
+    for confidence in sorted(grid):
+        numbers = summary(seen, confidence)["kinds"][kind.label]
+        if numbers["false_per_100_frames"] <= most_false:
+            return float(confidence)
     return float(max(grid))
 
 
@@ -156,9 +181,10 @@ def _numbers(mine: list[Sight], low: float, high: float, confidence: float) -> d
     }
 
 
-def _drawn(
-    loaded: LoadedConfig, test: DrawnTest
-) -> Iterator[tuple[bytes, list[DrawnObject], SceneCamera]]:
+_Picture = tuple[bytes, list[DrawnObject], SceneCamera, Conditions]
+
+
+def _drawn(loaded: LoadedConfig, test: DrawnTest) -> Iterator[_Picture]:
     parts = -(-test.pictures // test.part)
     sizes = [min(test.part, test.pictures - i * test.part) for i in range(parts)]
     with ProcessPoolExecutor(test.processes, mp_context=get_context("spawn")) as pool:
@@ -169,13 +195,14 @@ def _drawn(
             yield from job.result()
 
 
-def _part(
-    loaded: LoadedConfig, test: DrawnTest, number: int, count: int
-) -> list[tuple[bytes, list[DrawnObject], SceneCamera]]:
+def _part(loaded: LoadedConfig, test: DrawnTest, number: int, count: int) -> list[_Picture]:
     cv2.setNumThreads(1)
     camera = None if test.own_lens else scene_camera(loaded, test.size)
     drawn = pictures(count, test.seed + number, camera, size=test.size)
-    return [(encode_jpeg(image, _QUALITY), objects, view) for image, objects, _, view in drawn]
+    return [
+        (encode_jpeg(image, _QUALITY), objects, view, conditions)
+        for image, objects, conditions, view in drawn
+    ]
 
 
 def _look(detector: Detector, jpeg: bytes, view: SceneCamera) -> Detections:

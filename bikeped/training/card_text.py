@@ -37,9 +37,9 @@ others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 
 | machine | {machine}; PyTorch {torch} on the CPU, two threads{beside} |
 
 The input is 960 x 544 pixels, RGB / 255, the picture centred on grey 114; the output is laid out as
-`yolov8`. Scores are shifted so that the default `detection.confidence` of {confidence} is the one
-chosen on the validation pictures (where at most {most_false} false pedestrians or cyclists a 100
-frames were left); a score is no probability.
+`yolov8`. The scores of each class are shifted so that the default `detection.confidence` of
+{confidence} is the one chosen for it on the validation pictures, where at most {most_false} a 100
+frames were false; a score is no probability.
 
 ## What it is worth
 
@@ -77,7 +77,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         torch=training["torch"],
         beside=made.get("beside", ""),
         confidence=test["confidence"],
-        most_false=made["most_false"],
+        most_false=", ".join(f"{n:g} {name}s" for name, n in made["most_false"].items()),
     )
     for title, key in (
         ("Through the configured camera", "configured_camera"),
@@ -108,7 +108,23 @@ def _measured(title: str, test: Mapping[str, Any]) -> str:
             _row("within 15 m", numbers["within_15_m"]),
             *(_row(f"{r['from_m']:g} to {r['to_m']:g} m", r) for r in numbers["rings"]),
         ]
+    lines += [
+        "",
+        "**By light** (within 15 m; rain by itself)",
+        "",
+        "| light | frames | pedestrians | cyclists | false a 100 frames |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for light, row in test["lights"].items():
+        recalls = " | ".join(_percent(row[k.label]) for k in (Kind.PEDESTRIAN, Kind.CYCLIST))
+        lines.append(
+            f"| {light} | {row['frames']} | {recalls} | {row['false_per_100_frames']:.1f} |"
+        )
     return "\n".join(lines) + "\n"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1%}"
 
 
 def _row(ring: str, numbers: Mapping[str, Any]) -> str:

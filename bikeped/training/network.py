@@ -14,6 +14,7 @@ own centre. Only plain convolutions and ReLU, which every runtime has fast code 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -169,12 +170,12 @@ def multiply_adds(network: Any, width: int, height: int) -> int:
     return total
 
 
-def shift_scores(network: SmallNet, score: float, becomes: float) -> None:
-    """Moves every class's score so that what was `score` is `becomes`; their order stays.
+def shift_scores(network: SmallNet, score: Sequence[float], becomes: float) -> None:
+    """Moves every class's scores so that what was its `score` is `becomes`; their order stays.
 
-    So a network fits a threshold that others were configured for.
+    So each class has the threshold that suits it, and all of them the one that is configured.
     """
-    odds = [math.log(p / (1 - p)) for p in (score, becomes)]
+    odds = torch.tensor([math.log(p / (1 - p)) for p in (*score, becomes)])
     with torch.no_grad():
         for head in network.heads:
-            head.score.bias += odds[1] - odds[0]
+            head.score.bias += odds[-1] - odds[:-1]

@@ -14,6 +14,7 @@ from bikeped.scene import DrawnObject, scene_camera
 from bikeped.training.card import (
     DrawnTest,
     Sight,
+    by_light,
     choose_confidence,
     drawn_test,
     judge_picture,
@@ -116,11 +117,23 @@ def test_the_summary_counts_at_a_confidence():
     assert summary(sights(), 0.1)["kinds"]["pedestrian"]["within_15_m"]["recall"] == 1
 
 
+def test_lights_are_told_apart():
+    rows = by_light(sights(), ["day", "night"], 0.25)
+    assert rows["day"] == {
+        "frames": 1,
+        "false_per_100_frames": 0,
+        "pedestrian": 0.5,
+        "cyclist": None,
+    }
+    assert rows["night"]["false_per_100_frames"] == 100
+
+
 def test_the_confidence_is_the_lowest_that_keeps_the_promise():
     grid = [0.1, 0.2, 0.35, 0.5]
-    assert choose_confidence(sights(), grid, 1.0) == 0.35
-    assert choose_confidence(sights(), grid, 60) == 0.1
-    assert choose_confidence(sights(), [0.1], 1.0) == 0.1
+    assert choose_confidence(sights(), CYC, grid, 1.0) == 0.35
+    assert choose_confidence(sights(), CYC, grid, 60) == 0.1
+    assert choose_confidence(sights(), PED, grid, 0) == 0.1
+    assert choose_confidence(sights(), CYC, [0.1], 1.0) == 0.1
     assert [row["confidence"] for row in sweep(sights(), grid)] == grid
 
 
@@ -129,7 +142,8 @@ def test_the_bundled_model_is_shown_drawn_pictures():
     model = DetectionConfig(model=str(BUNDLED_FILE))
     seen = []
     test = DrawnTest(pictures=6, seed=9_700_001, part=3, processes=2)
-    rows = drawn_test(model, load_config(None), test, seen.append)
+    rows, lights = drawn_test(model, load_config(None), test, seen.append)
+    assert len(lights) == len(rows) == 6
     assert seen == [1, 2, 3, 4, 5, 6]
     near = [s for row in rows for s in row if s.distance_m < 15 and s.kind != Kind.VEHICLE]
     assert sum(s.found for s in near) >= 0.7 * len(near) > 0

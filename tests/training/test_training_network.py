@@ -16,6 +16,7 @@ from bikeped.training.network import (  # noqa: E402
     boxes_px,
     grid,
     multiply_adds,
+    shift_scores,
 )
 
 SIZE = (96, 64)
@@ -87,3 +88,16 @@ def test_before_it_has_learnt_it_sees_nobody(network):
     with torch.no_grad():
         score, _ = network(torch.zeros(1, 3, 64, 96))
     assert float(score.sigmoid().max()) < 0.1
+
+
+def test_scores_move_class_by_class_and_keep_their_order():
+    torch.manual_seed(1)
+    moved = SmallNet(3).eval()
+    picture = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        before = moved(picture)[0].sigmoid()
+        shift_scores(moved, [0.4, 0.5, 0.1], 0.1)
+        after = moved(picture)[0].sigmoid()
+    odds = (after / (1 - after)) / (before / (1 - before))
+    expected = torch.tensor([(0.1 / 0.9) / (0.4 / 0.6), (0.1 / 0.9), 1.0])
+    torch.testing.assert_close(odds.mean(2)[0], expected, rtol=1e-3, atol=1e-4)
