@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 SIZES = {"desktop": (1440, 900, 1.0), "phone": (390, 844, 2.0)}
 SCHEMES = ("light", "dark")
 QUALITY = 80
+PATIENCE_MS = 300_000  #: on a busy machine everything comes late
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
 
 
@@ -46,6 +47,7 @@ class Studio:
             has_touch=size == "phone",
             reduced_motion="reduce",
         )
+        context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
         page.goto(url)
         try:

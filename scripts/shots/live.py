@@ -1,41 +1,118 @@
-"""The live page: the demo's drawn crossing through the real loop, at its ALERT, and no contact."""
+"""The live page: a drawn crossing through the real loop, at its ALERT, and then without contact.
+
+The boxes are those of what was drawn, and the page says so: these are pictures of the page, not of
+a detector.
+"""
 
 from __future__ import annotations
 
+import logging
 import re
-import subprocess
-import sys
-from contextlib import ExitStack
-from typing import TYPE_CHECKING
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bikeped.config import LoadedConfig, load_config
+from bikeped.conformance.scenario import parse_scenario
+from bikeped.detection.base import DetectorAnswer
+from bikeped.scene import Conditions, ScenePainter, scene_camera
+from bikeped.scene.clip import read_sidecar, sidecar_path, write_clip
+from bikeped.service.replay import replay
+from bikeped.types import Detections
+from bikeped.web.service import ServicePages
 
 if TYPE_CHECKING:
     from screenshots import Studio
 
-PATIENCE_MS = 120_000
+LATE = 45  #: from this frame on there is time for a picture
+CROSSING = """
+name: Somebody crosses, a cyclist comes, another leaves
+hazard: standard
+expected: alert
+vehicle: bicycle
+agents:
+  - {id: 1, kind: pedestrian, path: [[0.0, 6.6, -6.2], [5.0, 5.6, -2.2]]}
+  - {id: 2, kind: cyclist, path: [[0.0, -13.0, -3.6], [5.0, 4.2, -3.4]]}
+  - {id: 3, kind: cyclist, path: [[0.0, 9.0, 3.0], [5.0, 23.0, 3.2]]}
+  - {id: 4, kind: car, path: [[0.0, 24.0, 1.2], [5.0, -8.0, 1.2]]}
+"""
+
+
+class _Eye:
+    """Reads the boxes of what was drawn; late in the clip it waits until the picture is taken."""
+
+    name = "none: the boxes of what was drawn"
+    model_hash: str | None = None
+
+    def __init__(self, clip: Path) -> None:
+        self._frames = read_sidecar(sidecar_path(clip)).frames
+        self.done = threading.Event()
+
+    def decode_size(self, width: int, height: int) -> tuple[int, int]:
+        return min(width, 640), min(height, 640)
+
+    def see(self, picture: Any) -> DetectorAnswer:
+        number = picture.frame.number
+        self.done.wait(1.2 if number > LATE else 0.05)
+        shown = [item for item in self._frames[number] if item.visible > 0.3]
+        found = Detections(
+            np.asarray([int(item.label) for item in shown], np.int8),
+            np.full(len(shown), 0.9, np.float32),
+            np.asarray([item.box_px for item in shown], np.float32).reshape(-1, 4),
+        )
+        return DetectorAnswer(found, 0.0, 0.0, 0.0)
+
+
+class _Showing:
+    """One replay with its pages, in a thread."""
+
+    def __init__(self, loaded: LoadedConfig, clip: Path) -> None:
+        self.eye = _Eye(clip)
+        self.url = ""
+        self._known = threading.Event()
+        handler = logging.Handler()
+        handler.emit = self._heard  # type: ignore[method-assign]
+        http = logging.getLogger("bikeped.telemetry.http")
+        http.addHandler(handler)
+        http.setLevel(logging.INFO)
+        pages = ServicePages(loaded)
+        self._thread = threading.Thread(
+            target=lambda: replay(loaded, str(clip), eye=self.eye, mqtt=False, pages=pages),
+            daemon=True,
+        )
+        self._thread.start()
+        assert self._known.wait(120)
+        http.removeHandler(handler)
+
+    def _heard(self, record: logging.LogRecord) -> None:
+        if found := re.search(r"http://\S+", record.getMessage()):
+            self.url = found[0]
+            self._known.set()
+
+    def end(self) -> None:
+        self.eye.done.set()
+        self._thread.join()
 
 
 def take(studio: Studio) -> None:
-    """Four pages look at one replay; each is kept at the alert."""
-    options = ["--out", str(studio.work), "--seconds", "12", "--web", "0"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "bikeped.cli.main", "--log-level", "info", "demo", *options],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        text=True,
-    )
-    assert process.stderr is not None
-    url = next(found[0] for line in process.stderr if (found := re.search(r"http://\S+", line)))
-    with ExitStack() as stack:
-        pages = {
-            f"{size}-{scheme}": stack.enter_context(studio.page(url, size, scheme))
-            for size in ("desktop", "phone")
-            for scheme in ("light", "dark")
-        }
-        for name, page in pages.items():
-            page.wait_for_selector("#state[data-state=ALERT]", timeout=PATIENCE_MS)
-            studio.keep(page, f"live-{name}", whole=name.startswith("phone"))
-        process.kill()
-        process.wait()
-        page = pages["phone-light"]
-        page.wait_for_selector("#live[data-contact=lost]", timeout=PATIENCE_MS)
-        studio.keep(page, "live-lost-phone-light")
+    """One replay for each look, kept at the alert."""
+    loaded = load_config(None, ["web.enabled=true", "web.port=0"])
+    clip = studio.work / "crossing.avi"
+    scenario = parse_scenario(CROSSING, "crossing.yaml")
+    painter = ScenePainter(scenario, scene_camera(loaded, (1920, 1080)), Conditions())
+    write_clip(painter, clip, fps=15)
+    for size in ("desktop", "phone"):
+        for scheme in ("light", "dark"):
+            with studio.page("about:blank", size, scheme) as page:
+                showing = _Showing(loaded, clip)
+                page.goto(showing.url)
+                page.wait_for_selector("#state[data-state=ALERT]")
+                page.wait_for_function("() => document.querySelector('#picture').naturalWidth > 0")
+                page.wait_for_selector("#health dd.ok-mark")
+                studio.keep(page, f"live-{size}-{scheme}", whole=size == "phone")
+                showing.end()
+                if (size, scheme) == ("phone", "light"):
+                    page.wait_for_selector("#live[data-contact=lost]")
+                    studio.keep(page, "live-lost-phone-light")
