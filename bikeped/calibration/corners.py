@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from bikeped.calibration.check import Checked, check_board
-from bikeped.calibration.detect_raw import raw_candidates
+from bikeped.calibration.detect_raw import quick_candidates, raw_candidates
 from bikeped.calibration.detect_remapped import remapped_candidates
 from bikeped.calibration.pictures import Picture, check_sizes, load_pictures, pictures_hash
 from bikeped.calibration.views import BoardPattern, BoardView, Found, Refused
@@ -82,7 +82,7 @@ def check_pattern(pattern: BoardPattern) -> None:
 
 
 def find_board(grey: ImageArray, pattern: BoardPattern, *, thorough: bool = True) -> _Seen:
-    """One picture's board. Not `thorough`: on the picture as it is only, for live frames."""
+    """One picture's board. Not `thorough`: only the quickest detector, for live frames."""
     why = ""
     for candidate in _candidates(grey, pattern, thorough):
         checked = check_board(grey, pattern, candidate)
@@ -94,9 +94,11 @@ def find_board(grey: ImageArray, pattern: BoardPattern, *, thorough: bool = True
 
 
 def _candidates(grey: ImageArray, pattern: BoardPattern, thorough: bool) -> Iterator[FloatArray]:
+    if not thorough:
+        yield from quick_candidates(grey, pattern)
+        return
     yield from raw_candidates(grey, pattern)
-    if thorough:
-        yield from remapped_candidates(grey, pattern)
+    yield from remapped_candidates(grey, pattern)
 
 
 def _twins(pictures: Sequence[Picture]) -> dict[int, int]:

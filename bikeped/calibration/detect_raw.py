@@ -21,6 +21,7 @@ FIRST_SIDE_PX = 1100
 _SCALES = (1.0, 0.5, 2.0, 0.35)  # of that; twice only while the result stays below _LARGEST
 _SECTOR_SCALES = (0.5, 1.0)
 _LARGEST_PX = 2300
+_QUICK_PX = 640
 
 
 def raw_candidates(grey: ImageArray, pattern: BoardPattern) -> Iterator[FloatArray]:
@@ -35,6 +36,14 @@ def raw_candidates(grey: ImageArray, pattern: BoardPattern) -> Iterator[FloatArr
                 yield found
     if first < 1.0:
         found = at_scale(classic, grey, pattern, min(1.0, 2 * first))
+        if found is not None:
+            yield found
+
+
+def quick_candidates(grey: ImageArray, pattern: BoardPattern) -> Iterator[FloatArray]:
+    """For live frames, most of which hold no board: small and with a quick way out, then full."""
+    for side in (_QUICK_PX, FIRST_SIDE_PX):
+        found = at_scale(in_a_hurry, grey, pattern, min(1.0, side / max(grey.shape)))
         if found is not None:
             yield found
 
@@ -62,6 +71,13 @@ def classic(grey: ImageArray, pattern: BoardPattern) -> FloatArray | None:
         ),
         pattern,
     )
+
+
+def in_a_hurry(grey: ImageArray, pattern: BoardPattern) -> FloatArray | None:
+    """As `classic`, but gives up where the picture does not look as if it held a board."""
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK
+    size = (pattern.columns, pattern.rows)
+    return _corners(cv2.findChessboardCorners(grey, size, flags=flags), pattern)
 
 
 def sectors(grey: ImageArray, pattern: BoardPattern) -> FloatArray | None:
