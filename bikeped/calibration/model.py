@@ -69,6 +69,13 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.names)
 
+    def views(self) -> list[BoardView]:
+        """Back to one view a picture."""
+        return [
+            BoardView(name, np.flatnonzero(seen), uv[seen], self.width, self.height)
+            for name, uv, seen in zip(self.names, self.uv_px, self.seen, strict=True)
+        ]
+
     def rows(self, keep: BoolArray | IntArray) -> Sightings:
         """Some of the pictures."""
         index = np.arange(len(self))[keep]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -119,17 +120,18 @@ def prepare(found: Found) -> Prepared:
 
 def _enough(views: Sequence[BoardView], found: Found) -> None:
     size = f"{found.pattern.columns}x{found.pattern.rows}"
+    pictures = "1 picture" if found.pictures == 1 else f"{found.pictures} pictures"
     if not views:
         first = found.refused[:1]
-        why = f" (first: {first[0].name}: {first[0].why})" if first else ""
+        why = f" ({Path(first[0].name).name}: {first[0].why})" if first else ""
         raise CalibrationError(
-            f"IMAGES: no board of {size} inner corners in {found.pictures} pictures{why}; count "
+            f"IMAGES: no board of {size} inner corners in {pictures}{why}; count "
             "the corners where four squares meet and give them as --pattern COLUMNSxROWS"
         )
     if len(views) < FEWEST_BOARDS:
         what = "one board" if len(views) == 1 else f"{len(views)} boards"
         raise CalibrationError(
-            f"IMAGES: {what} of {size} inner corners in {found.pictures} pictures, and a lens "
+            f"IMAGES: {what} of {size} inner corners in {pictures}, and a lens "
             f"needs at least {FEWEST_BOARDS}, better 15, all over the picture; photograph more, or "
             "correct --pattern"
         )

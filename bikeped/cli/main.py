@@ -20,6 +20,7 @@ COMMANDS = {
     "config": "bikeped.cli.config",
     "doctor": "bikeped.cli.doctor",
     "align": "bikeped.cli.align",
+    "calibrate": "bikeped.cli.calibrate",
     "conformance": "bikeped.cli.conformance",
     "testbench": "bikeped.cli.testbench",
     "scene": "bikeped.cli.scene",

@@ -1,0 +1,114 @@
+"""`bikeped calibrate`: the lens, from pictures of a checkerboard."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from bikeped.cli.calibrate_options import PATTERN, Asked
+from bikeped.cli.common import config_options, console, json_option
+from bikeped.cli.guard import guarded
+from bikeped.errors import BikepedError
+
+_MODELS = ("equidistant", "equisolid", "stereographic", "orthographic", "linear", "equalarea")
+_DEFAULT_OUT = Path("camera_calibration.json")
+
+
+@click.command("calibrate")
+@click.argument("images", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--pattern",
+    type=PATTERN,
+    metavar="COLUMNSxROWS",
+    help="Inner corners of the board, where four squares meet, e.g. 8x6.",
+)
+@click.option(
+    "--square",
+    "square_m",
+    type=click.FloatRange(0, 10, min_open=True),
+    metavar="METRES",
+    help="Side of a square, as measured on the print. The lens does not depend on it.",
+)
+@click.option(
+    "--model",
+    type=click.Choice(_MODELS),
+    help="Lens model to write. Default: equidistant; with --compare the recommended one.",
+)
+@click.option(
+    "--terms",
+    type=click.Choice(["0", "2", "4"]),
+    help="Radial terms to fit. Default: 4; with --compare as recommended.",
+)
+@click.option("--board-shape", is_flag=True, help="Fit the board's shape too: boards bend.")
+@click.option("--compare", is_flag=True, help="Fit all models on the same corners.")
+@click.option(
+    "--folds",
+    type=click.IntRange(2, 1000),
+    help="Cross-validation: each fold's pictures are predicted from the others. Default: each "
+    "picture is a fold.",
+)
+@click.option(
+    "--report",
+    "report_path",
+    type=click.Path(path_type=Path),
+    metavar="FILE.html",
+    help="A page with every picture's residuals, coverage and the lens's profile.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Calibration file; what it held is kept as FILE.bak. Default: camera_calibration.json "
+    "in this folder, unless it exists.",
+)
+@config_options
+@json_option
+@guarded
+def command(
+    images: tuple[Path, ...],
+    pattern: tuple[int, int] | None,
+    square_m: float | None,
+    model: str | None,
+    terms: str | None,
+    board_shape: bool,
+    compare: bool,
+    folds: int | None,
+    report_path: Path | None,
+    out: Path | None,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    json_path: str | None,
+) -> int:
+    """Measure the lens from IMAGES: pictures of a checkerboard, a folder of them, or a video.
+
+    Sensor frames (camera.width x camera.height) are calibrated in the square crop that the
+    configuration describes, pictures of any other size as they are.
+    """
+    # The matrices are small: a second thread costs more than it does, some twenty times over. The
+    # libraries read this once, when they are loaded.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    try:
+        from bikeped.cli.calibrate_run import run
+        from bikeped.cli.calibrate_tables import print_result
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith("bikeped"):
+            raise
+        raise BikepedError(
+            f"{error.name}: not installed, and calibration needs it; pip install "
+            '"bikeped[calibrate]"'
+        ) from error
+    if report_path is not None:
+        from bikeped.conformance.figure_style import require_matplotlib
+
+        require_matplotlib()
+    screen = console(json_path)
+    asked = Asked.of(pattern, square_m, model, terms, board_shape, compare, folds or 0)
+    done = run(images, asked, config_path, overrides)
+    written = done.write(report_path, json_path, out, _DEFAULT_OUT)
+    if json_path != "-":
+        print_result(screen, done)
+        for line in written:
+            click.echo(line)
+    return 0
