@@ -11,6 +11,7 @@ import contextlib
 import socket
 import time
 from collections.abc import Iterator
+from pathlib import PurePath
 from typing import Any
 
 import msgspec
@@ -127,7 +128,7 @@ class Live:
             "stages": STAGES,
             "config_hash": loaded.hash,
             "calibration_hash": loaded.calibration_hash,
-            "source": self._inside.source,
+            "source": shown_source(self._inside.source),
             "detector": self._inside.detector,
             "light": config.feedback.light,
             "rule": config.decision.rule,
@@ -154,6 +155,14 @@ class Live:
             status = {"health": self._inside.health(), "mqtt": mqtt}
             self._status = (now_s, msgspec.json.encode(status))
         return self._status[1]
+
+
+def shown_source(source: str) -> str:
+    """A camera's name for people: without a password in an address, or the way to a file."""
+    if "://" in source:
+        scheme, _, rest = source.partition("://")
+        return f"{scheme}://{rest.rpartition('@')[2]}"
+    return source if source.startswith("/dev/") else PurePath(source).name or source
 
 
 def add_live(app: web.Application, live: Live) -> None:

@@ -22,7 +22,7 @@ from bikeped.service.replay import replay
 from bikeped.telemetry.http import HttpServer
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.mqtt import MqttStatus
-from bikeped.web.live import Live, add_live
+from bikeped.web.live import Live, add_live, shown_source
 from bikeped.web.server import make_pages
 from bikeped.web.service import ServicePages
 from bikeped.web.watch import ALERTS, TREND_S, Watch
@@ -115,6 +115,20 @@ async def test_events_tell_the_state_the_reason_and_the_tracks(make_page):
         status = await events.until("status")
         assert status["health"]["counters"]["dropped"] == 2
         assert status["mqtt"] is None
+
+
+@pytest.mark.parametrize(
+    ("source", "shown"),
+    [
+        ("/dev/video0", "/dev/video0"),
+        ("/home/someone/rides/day.avi", "day.avi"),
+        ("rtsp://camera.lan/1", "rtsp://camera.lan/1"),
+        ("rtsp://admin:p@ss/word@10.0.0.4:554/1", "rtsp://10.0.0.4:554/1"),
+        ("0", "0"),
+    ],
+)
+def test_no_password_and_no_folder_of_a_source_is_shown(source, shown):
+    assert shown_source(source) == shown
 
 
 async def test_the_broker_is_told_as_it_stands(make_page):
