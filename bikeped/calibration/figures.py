@@ -148,7 +148,7 @@ def profile_figure(fit: Fit, field: Field) -> bytes:
         width=7.0,
         height=3.2,
         columns=2,
-        legend_rows=1,
+        legend_rows=2,
     ) as sheet:
         left, right = sheet.axes
         left.plot(degrees, own, color=BLACK, lw=2.2, label=fit.name)
@@ -175,7 +175,7 @@ def profile_figure(fit: Fit, field: Field) -> bytes:
         right.set_ylim(-bound, bound)
         right.set_ylabel("ideal minus fitted radius, px")
         handles = [*left.get_lines()[:1], *right.get_lines()[: len(FISHEYE)]]
-        sheet.legend(handles, columns=5)
+        sheet.legend(handles, columns=3)
         return png(sheet)
 
 
@@ -230,8 +230,8 @@ def coverage_figure(fit: Fit, field: Field, gaps: FloatArray | None = None) -> b
     with Sheet(
         "Where the boards were",
         "Each dot a corner, in the lens's own directions: the middle is the optical axis, the "
-        "circle the edge of the field of view. Hatched: parts with too few corners, where a board "
-        "would help most. Picture axes: right is right, down is down.",
+        "circle the edge of the field of view. Hatched: parts of the picture with too few corners, "
+        "where a board would help most. White and empty at the rim: not on the picture.",
         width=5.4,
         height=5.2,
         subplot_kw={"projection": "polar"},
