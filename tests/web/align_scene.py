@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 HEIGHT_M, PITCH_DEG = 4.21, -7.3
 CROSSES_M = ((4.0, -1.5), (6.0, 2.0), (10.0, -3.0), (15.0, 4.0))
 ORANGE = (255, 90, 30)
+SIZE = (1920, 1080)
 
 
 @dataclass(frozen=True)
@@ -31,14 +32,15 @@ class Scene:
 
 
 def draw_scene(folder: Path) -> Scene:
-    """Writes config.yaml into `folder` and draws the picture, 3840 x 2160."""
+    """Writes config.yaml into `folder` and draws the picture, at half the sensor's size: a browser
+    without a GPU is slow with large ones."""
     for name in ("config.yaml", "camera_calibration.json"):
         (folder / name).write_bytes((ROOT / name).read_bytes())
     loaded = load_config(folder / "config.yaml")
-    frame = framing(loaded).for_frame(3840, 2160)
+    frame = framing(loaded).for_frame(*SIZE)
     camera = replace(ground_camera(loaded), height_m=HEIGHT_M, pitch_deg=PITCH_DEG)
-    image = np.zeros((2160, 3840, 3), np.uint8)
-    image[:] = np.linspace(150, 70, 2160).astype(np.uint8)[:, None, None]
+    image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    image[:] = np.linspace(150, 70, SIZE[1]).astype(np.uint8)[:, None, None]
     found = []
     for x, y in CROSSES_M:
         reach = 0.04 * math.hypot(x, y)

@@ -1,18 +1,10 @@
 // The picture with the grid and the marks: zoom, pan, drag, draw. It knows pixels, no metres and no
 // lens: all lines come from the box. Frame pixel (u, v) has its middle at the integer.
 
+import { loupe, scene } from "/static/align-paint.js";
 import { canvasOf, el, svg } from "/static/ui.js";
 
-export const KINDS = {
-  metre: { label: "1 m", colour: "#e6ecf0", width: 0.8, alpha: 0.65 },
-  five: { label: "5 m", colour: "#ffffff", width: 1.3, alpha: 0.95 },
-  bearing: { label: "Bearings", colour: "#82d7ff", width: 1, alpha: 0.9 },
-  ring: { label: "Rings", colour: "#ffd028", width: 2, alpha: 1 },
-  horizon: { label: "Horizon", colour: "#ff6ef0", width: 2, alpha: 1 },
-  circle: { label: "Lens circle", colour: "#ffffff", width: 1.5, alpha: 0.9 },
-};
 const TAP_PX = 8; // a finger that moves less has not moved
-const LOUPE_PX = 132;
 
 export class View {
   // `on`: tap(u, v), moved(mark), chosen(mark), removed(mark), entered(mark)
@@ -157,119 +149,8 @@ export class View {
 
   draw(context) {
     if (!this.size || !this.scale) return;
-    this.scene(context, this.scale, this.left, this.top);
+    scene(this, context, this.scale, this.left, this.top);
     Object.assign(this.stage.dataset, { scale: this.scale, left: this.left, top: this.top });
-  }
-
-  scene(context, scale, left, top) {
-    const dots = scale * (window.devicePixelRatio || 1);
-    const level = Math.min(this.levels.length - 1, Math.max(0, Math.floor(Math.log2(1 / dots))));
-    context.imageSmoothingEnabled = scale < 3;
-    context.drawImage(this.levels[level], left, top, this.size.width * scale, this.size.height * scale);
-    if (!this.grid) return;
-    const matrix = new DOMMatrix([scale, 0, 0, scale, left, top]);
-    context.lineJoin = context.lineCap = "round";
-    const moved = Object.entries(this.grid).map(([kind, path]) => {
-      const style = KINDS[kind] ?? { ...KINDS.five, width: 2.4 };
-      const shown = new Path2D();
-      shown.addPath(path, matrix);
-      return { style, shown, hidden: this.hidden.has(kind === "ahead" ? "five" : kind), thin: kind === "metre" };
-    }).filter((item) => !item.hidden);
-    context.strokeStyle = "rgb(8 11 14 / 55%)";
-    for (const { style, shown, thin } of moved) {
-      context.lineWidth = style.width + (thin ? 1 : 2);
-      context.globalAlpha = thin ? 0.5 : 1;
-      context.stroke(shown);
-    }
-    for (const { style, shown } of moved) {
-      context.globalAlpha = style.alpha;
-      context.strokeStyle = style.colour;
-      context.lineWidth = style.width;
-      context.stroke(shown);
-    }
-    context.globalAlpha = 1;
-    const at = ([u, v]) => [(u + 0.5) * scale + left, (v + 0.5) * scale + top];
-    this.drawLabels(context, at);
-    this.drawPoints(context, at);
-  }
-
-  drawLabels(context, at) {
-    context.font = "600 12px system-ui, sans-serif";
-    context.textAlign = "center";
-    context.textBaseline = "middle";
-    const taken = [];
-    for (const { u, v, text, kind } of this.labels) {
-      if (this.hidden.has(kind)) continue;
-      const [x, y0] = at([u, v]);
-      const y = kind === "horizon" ? y0 - 13 : y0;
-      const half = context.measureText(text).width / 2 + 4;
-      const box = [x - half, y - 9, x + half, y + 9];
-      if (taken.some((b) => box[0] < b[2] && b[0] < box[2] && box[1] < b[3] && b[1] < box[3])) continue;
-      taken.push(box);
-      context.fillStyle = "rgb(8 11 14 / 72%)";
-      context.fillRect(box[0], box[1], 2 * half, 18);
-      context.fillStyle = KINDS[kind].colour;
-      context.fillText(text, x, y + 0.5);
-    }
-  }
-
-  // The optical centre, what read 10 m before, and where each measurement would lie.
-  drawPoints(context, at) {
-    const ring = (point, radius, colour) => {
-      const [x, y] = at(point);
-      for (const [style, width] of [["#0a0d10", 5], [colour, 2.5]]) {
-        context.beginPath();
-        context.arc(x, y, radius, 0, 7);
-        context.strokeStyle = style;
-        context.lineWidth = width;
-        context.stroke();
-      }
-    };
-    if (this.centre && !this.hidden.has("circle")) {
-      const [x, y] = at(this.centre);
-      for (const [style, width] of [["#0a0d10", 4], ["#fff", 1.5]]) {
-        context.beginPath();
-        context.moveTo(x - 7, y); context.lineTo(x + 7, y);
-        context.moveTo(x, y - 7); context.lineTo(x, y + 7);
-        context.strokeStyle = style;
-        context.lineWidth = width;
-        context.stroke();
-      }
-    }
-    if (this.ten) ring(this.ten, 9, "#35b5f2");
-    for (const mark of this.marks) {
-      if (!mark.goal) continue;
-      const [x, y] = at([mark.u, mark.v]), [gx, gy] = at(mark.goal);
-      for (const [style, width] of [["#0a0d10", 5], ["#ffd028", 2]]) {
-        context.beginPath();
-        context.moveTo(x, y);
-        context.lineTo(gx, gy);
-        context.strokeStyle = style;
-        context.lineWidth = width;
-        context.stroke();
-      }
-      ring(mark.goal, 4, "#ffd028");
-    }
-  }
-
-  drawLoupe(mark) {
-    const dots = Math.min(window.devicePixelRatio || 1, 3);
-    const canvas = this.loupe, scale = Math.max(3 * this.scale, 1);
-    canvas.width = canvas.height = LOUPE_PX * dots;
-    const context = canvas.getContext("2d");
-    context.setTransform(dots, 0, 0, dots, 0, 0);
-    const half = LOUPE_PX / 2;
-    this.scene(context, scale, half - (mark.u + 0.5) * scale, half - (mark.v + 0.5) * scale);
-    for (const [style, width] of [["#0a0d10", 3], ["#ff5a3c", 1]]) {
-      context.beginPath();
-      for (const [a, b] of [[12, half - 5], [half + 5, LOUPE_PX - 12]]) {
-        context.moveTo(a, half); context.lineTo(b, half);
-        context.moveTo(half, a); context.lineTo(half, b);
-      }
-      context.strokeStyle = style;
-      context.lineWidth = width;
-      context.stroke();
-    }
   }
 
   // --- marks: buttons over the picture, so that keyboard and screen reader have them
@@ -352,7 +233,7 @@ export class View {
         this.move(held.mark, held.u + (x - held.x) / this.scale, held.v + (y - held.y) / this.scale);
         this.loupe.hidden = false;
         this.loupe.classList.toggle("right", x < this.width / 2);
-        this.drawLoupe(held.mark);
+        loupe(this, held.mark);
         return;
       }
       if (still && Math.hypot(x - last[0], y - last[1]) < TAP_PX) return;

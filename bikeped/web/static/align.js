@@ -1,35 +1,21 @@
 // The align page: numbers, marks, fit, save. What any of it means on the ground the box works out.
 
-import { $, announce, el, fixed, metres, request, setText, toast } from "/static/ui.js";
+import { Dials } from "/static/align-dials.js";
+import { fitAnswer } from "/static/align-fit.js";
 import { MarkList } from "/static/align-marks.js";
-import { KINDS, View } from "/static/align-view.js";
-
-const NAMES = {
-  height_m: ["Height", "m", 4],
-  pitch_deg: ["Pitch", "°", 3],
-  radius_px: ["Radius", "px", 2],
-  cx: ["Centre, across", "px", 2],
-  cy: ["Centre, down", "px", 2],
-  heading_deg: ["Heading", "°", 3],
-};
-const HINTS = {
-  height_m: "of the lens above the ground",
-  pitch_deg: "0 looks level, negative looks down",
-  radius_px: "of the lens circle, in pixels of the square crop",
-  heading_deg: "turns the grid to the right of where the camera looks",
-};
-const FIRST = ["height_m", "pitch_deg", "radius_px"];
+import { KINDS } from "/static/align-paint.js";
+import { View } from "/static/align-view.js";
+import { NAMES, rounded, sign } from "/static/align-words.js";
+import { $, announce, el, metres, request, setText, toast } from "/static/ui.js";
 
 let box = null; // what /align/state said
-let values = {};
 let before = null; // the numbers before the last fit
-let coarse = false;
 let marks = [];
 let between = [];
 let chosen = null;
 const free = new Set(["height_m", "pitch_deg"]);
-const dials = new Map();
 
+const dials = new Dials(() => changed());
 const view = new View(
   { stage: $("#stage"), canvas: $("#picture"), pins: $("#pins"), loupe: $("#loupe") },
   {
@@ -53,73 +39,6 @@ const list = new MarkList({
   betweenChanged: () => remember(),
 });
 
-const rounded = (key, value) => Number(value.toFixed(NAMES[key][2]));
-const minus = (text) => text.replace("-", "−");
-function sign(value, digits) {
-  const size = Math.abs(value).toFixed(digits);
-  return Number(size) === 0 ? size : `${value < 0 ? "−" : "+"}${size}`;
-}
-const unitOf = (key) => (NAMES[key][1] === "°" ? "°" : ` ${NAMES[key][1]}`);
-
-// --- numbers
-
-function makeDials() {
-  for (const field of box.fields) {
-    const [name, unit] = NAMES[field.key];
-    const id = `dial-${field.key}`;
-    const figure = el("input", { type: "number", id, step: "any", min: field.min, max: field.max, autocomplete: "off" });
-    const slider = el("input", { type: "range", min: field.from, max: field.to, step: field.step, "aria-label": `${name}, slider` });
-    const step = (way) => {
-      const size = coarse ? field.coarse : field.step;
-      set(field.key, Math.round(values[field.key] / size + way) * size);
-    };
-    figure.addEventListener("input", () => {
-      if (figure.value.trim() !== "" && figure.validity.valid) set(field.key, Number(figure.value), figure);
-    });
-    figure.addEventListener("change", () => showDial(field.key));
-    figure.addEventListener("keydown", (event) => {
-      const way = { ArrowUp: 1, ArrowDown: -1 }[event.key];
-      if (!way) return;
-      event.preventDefault();
-      step(way);
-    });
-    slider.addEventListener("input", () => set(field.key, Number(slider.value), slider));
-    const less = el("button", { type: "button", "aria-label": `${name}: less`, onclick: () => step(-1) }, el("span", { "aria-hidden": "true" }, "−"));
-    const more = el("button", { type: "button", "aria-label": `${name}: more`, onclick: () => step(1) }, el("span", { "aria-hidden": "true" }, "+"));
-    const effect = el("span", {});
-    const about = el("p", { class: "note", id: `${id}-note` }, HINTS[field.key] ? `${HINTS[field.key]}. ` : "",
-      FIRST.slice(0, 2).includes(field.key) || field.key === "heading_deg" ? "" : `From ${field.origin}. `, effect);
-    figure.setAttribute("aria-describedby", about.id);
-    const node = el("div", { class: "dial" },
-      el("div", { class: "head" }, el("label", { for: id }, name), el("span", { class: "figure" }, figure, el("span", { class: "unit" }, unit))),
-      less, slider, more, about);
-    $(FIRST.includes(field.key) ? "#dials" : "#more-dials").append(node);
-    dials.set(field.key, { figure, slider, effect });
-  }
-}
-
-function showDial(key, but = null) {
-  const { figure, slider } = dials.get(key);
-  const value = rounded(key, values[key]);
-  if (figure !== but) figure.value = value;
-  if (slider !== but) slider.value = value;
-  slider.setAttribute("aria-valuetext", `${value}${unitOf(key)}`);
-}
-
-function set(key, value, from = null) {
-  const field = box.fields.find((item) => item.key === key);
-  const lowest = key === "height_m" ? 0.05 : key === "radius_px" ? 1 : field.min;
-  values[key] = rounded(key, Math.min(Math.max(value, lowest), field.max));
-  showDial(key, from);
-  changed();
-}
-
-function setAll(next) {
-  values = { ...next };
-  for (const key of dials.keys()) showDial(key);
-  changed();
-}
-
 function changed() {
   showChanges();
   redraw();
@@ -141,7 +60,7 @@ async function redraw() {
   do {
     again = false;
     try {
-      const answer = await request("/align/grid", { json: { values, frame: view.size, marks: marks.map(asPoint) } });
+      const answer = await request("/align/grid", { json: { values: dials.values, frame: view.size, marks: marks.map(asPoint) } });
       trouble("");
       view.setGrid(answer.grid, answer.at_10m && answer.at_10m.pixel);
       showTen(answer.at_10m);
@@ -161,14 +80,7 @@ function trouble(text) {
 
 function showTen(ten) {
   const place = $("#ten-text");
-  for (const [key, { effect }] of dials) {
-    const moves = ten && ten.steps[key];
-    const known = typeof moves === "number";
-    const flat = known && Math.abs(moves) < 0.0005;
-    setText(effect, known
-      ? `${sign(ten.by[key], ten.by[key] < 1 ? 1 : 0)}${unitOf(key)} ${flat ? "leaves a 10 m mark where it is" : `moves a 10 m mark by ${sign(100 * moves, 0)} cm`}.`
-      : "");
-  }
+  dials.showEffects(ten);
   if (!ten) return setText(place, "10 m is not in view.");
   if (ten.reads_m === null) return place.replaceChildren("10 m mark: ", el("b", {}, "above the horizon"), " now.");
   const moved = ten.reads_m - ten.was_m;
@@ -262,7 +174,7 @@ function points() {
     frame: view.size,
     marks: measured.map(asPoint),
     between: pairs.map((pair) => ({ first: name(pair.first), second: name(pair.second), distance_m: pair.distance_m })),
-    values,
+    values: dials.values,
     free: Object.keys(NAMES).filter((key) => free.has(key)),
   };
 }
@@ -303,11 +215,11 @@ async function fit() {
   try {
     const answer = await request("/align/fit", { json: points() });
     if (answer.refused) throw new Error(`${answer.refused[0].toUpperCase()}${answer.refused.slice(1)}.`);
-    before = { ...values };
+    before = { ...dials.values };
     $("#undo").hidden = false;
     const next = Object.fromEntries(Object.entries(answer.values).map(([key, value]) => [key, rounded(key, value)]));
-    showFit(answer, next);
-    setAll(next);
+    place.replaceChildren(...fitAnswer(answer, next));
+    dials.setAll(next);
   } catch (error) {
     place.replaceChildren(el("p", { class: "error" }, error.message));
   } finally {
@@ -315,43 +227,24 @@ async function fit() {
   }
 }
 
-function showFit(answer, next) {
-  const found = Object.entries(answer.error).map(([key, error]) => {
-    const digits = unitOf(key) === " px" ? 1 : 2;
-    return `${NAMES[key][0]} ${minus(fixed(next[key], digits))} ± ${fixed(error, digits)}${unitOf(key)}`;
-  });
-  const said = [el("p", { class: "verdict" }, `${found.join(", ")}.`)];
-  if (answer.at_10m_error_m !== null) said.push(el("p", {}, `What reads 10 m is 10 m ± ${fixed(100 * answer.at_10m_error_m, 0)} cm.`));
-  if (answer.spare_measurements === 0) said.push(el("p", { class: "warn" }, "No measurement is left over to check these numbers. Add a mark."));
-  if (answer.suspect) said.push(el("p", { class: "warn" }, `The others agree without mark ${answer.suspect}: set and measure it again.`));
-  else if (!answer.agrees) said.push(el("p", { class: "warn" }, "The marks do not agree with one another: set and measure them again."));
-  const rows = answer.residuals.map((row) => el("tr", {},
-    el("th", { scope: "row" }, row.mark), el("td", {}, { distance: "distance", right: "right", forward: "forward", spacing: "between" }[row.what]),
-    el("td", { class: "number" }, minus(fixed(row.measured_m, 2))), el("td", { class: "number" }, minus(fixed(row.read_m, 2))),
-    el("td", { class: "number" }, row.strange ? el("span", { class: "bad-mark" }, el("span", { class: "unseen" }, "strange: ")) : null, sign(100 * row.off_m, 1))));
-  const head = ["Mark", "What", "Tape, m", "Reads, m", "Off, cm"].map((text, i) => el("th", { scope: "col", class: i > 1 ? "number" : null }, text));
-  said.push(el("div", { class: "scroll" }, el("table", {}, el("caption", { class: "unseen" }, "What is left over"), el("thead", {}, el("tr", {}, head)), el("tbody", {}, rows))));
-  $("#fit-answer").replaceChildren(...said);
-}
-
 // --- save
 
 function differing() {
-  return Object.keys(NAMES).filter((key) => key in values
-    && Math.abs(values[key] - rounded(key, box.filed[key])) > 0.5 * 10 ** -NAMES[key][2]);
+  return Object.keys(NAMES).filter((key) => key in dials.values
+    && Math.abs(dials.values[key] - rounded(key, box.filed[key])) > 0.5 * 10 ** -NAMES[key][2]);
 }
 
 function showChanges() {
   const keys = differing();
   $("#changes tbody").replaceChildren(...keys.map((key) => el("tr", {},
     el("th", { scope: "row" }, `camera.${key}`),
-    el("td", { class: "number" }, `${rounded(key, box.filed[key])}`), el("td", { class: "number" }, el("b", {}, `${values[key]}`)))));
+    el("td", { class: "number" }, `${rounded(key, box.filed[key])}`), el("td", { class: "number" }, el("b", {}, `${dials.values[key]}`)))));
   $("#changes").hidden = keys.length === 0;
   $("#no-changes").hidden = keys.length > 0;
   $("#save").disabled = keys.length === 0 || box.cannot_save !== null;
   $("#by-hand").hidden = keys.length === 0;
   $("#by-hand").open = box.cannot_save !== null;
-  setText($("#yaml"), `camera:\n${keys.map((key) => `  ${key}: ${values[key]}\n`).join("")}`);
+  setText($("#yaml"), `camera:\n${keys.map((key) => `  ${key}: ${dials.values[key]}\n`).join("")}`);
 }
 
 function showFile() {
@@ -367,7 +260,7 @@ async function save() {
   const button = $("#save"), place = $("#saved");
   button.disabled = true;
   try {
-    const answer = await request("/align/save", { json: { values: Object.fromEntries(differing().map((key) => [key, values[key]])), sha256: box.sha256 } });
+    const answer = await request("/align/save", { json: { values: Object.fromEntries(differing().map((key) => [key, dials.values[key]])), sha256: box.sha256 } });
     box = await request("/align/state");
     showFile();
     place.replaceChildren(
@@ -437,18 +330,16 @@ function listen() {
   $("#all").addEventListener("click", () => view.show(view.contain()));
   $("#renew").addEventListener("click", newPicture);
   const steps = (big) => {
-    coarse = big;
+    dials.setCoarse(big);
     $("#fine").setAttribute("aria-pressed", String(!big));
     $("#coarse").setAttribute("aria-pressed", String(big));
-    for (const field of box.fields) dials.get(field.key).slider.step = big ? field.coarse : field.step;
-    for (const key of dials.keys()) showDial(key);
   };
   $("#fine").addEventListener("click", () => steps(false));
   $("#coarse").addEventListener("click", () => steps(true));
-  $("#back").addEventListener("click", () => setAll(box.filed));
+  $("#back").addEventListener("click", () => dials.setAll(box.filed));
   $("#fit").addEventListener("click", fit);
   $("#undo").addEventListener("click", () => {
-    if (before) setAll(before);
+    if (before) dials.setAll(before);
     $("#undo").hidden = true;
     $("#fit-answer").replaceChildren();
     $("#fit").focus();
@@ -502,11 +393,8 @@ async function open() {
     trouble(error.message);
     return;
   }
-  values = { ...box.start };
-  for (const key of Object.keys(values)) values[key] = rounded(key, values[key]);
-  makeDials();
+  dials.make(box.fields, box.start);
   makeChoices();
-  for (const key of dials.keys()) showDial(key);
   $("#renew").hidden = !box.live;
   showFile();
   showChanges();
