@@ -62,6 +62,25 @@ _DEFAULT_OUT = Path("camera_calibration.json")
     help="Calibration file; what it held is kept as FILE.bak. Default: camera_calibration.json "
     "in this folder, unless it exists.",
 )
+@click.option(
+    "--live",
+    is_flag=True,
+    help="Take the pictures now, guided, from camera.source; IMAGES is the folder for them.",
+)
+@click.option(
+    "--board",
+    "board_path",
+    type=click.Path(path_type=Path),
+    metavar="FILE.pdf",
+    help="Write a board to print, and do nothing else.",
+)
+@click.option(
+    "--page",
+    type=click.Choice(["a4", "a3", "letter"]),
+    default="a4",
+    show_default=True,
+    help="Paper for --board.",
+)
 @config_options
 @json_option
 @guarded
@@ -76,6 +95,9 @@ def command(
     folds: int | None,
     report_path: Path | None,
     out: Path | None,
+    live: bool,
+    board_path: Path | None,
+    page: str,
     config_path: Path | None,
     overrides: tuple[str, ...],
     json_path: str | None,
@@ -90,6 +112,7 @@ def command(
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     try:
+        from bikeped.cli.calibrate_capture import live_pictures, write_board
         from bikeped.cli.calibrate_run import run
         from bikeped.cli.calibrate_tables import print_result
     except ModuleNotFoundError as error:
@@ -105,6 +128,11 @@ def command(
         require_matplotlib()
     screen = console(json_path)
     asked = Asked.of(pattern, square_m, model, terms, board_shape, compare, folds or 0)
+    if board_path is not None:
+        write_board(board_path, asked.pattern, page, screen)
+        return 0
+    if live:
+        images = live_pictures(images, asked.pattern, config_path, overrides, screen)
     done = run(images, asked, config_path, overrides)
     written = done.write(report_path, json_path, out, _DEFAULT_OUT)
     if json_path != "-":

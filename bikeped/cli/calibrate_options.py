@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from bikeped.calibration.views import BoardPattern
 from bikeped.errors import BikepedError
 
 #: A board needs corners in two directions, and no printed one has more.
@@ -68,6 +69,11 @@ class Asked:
             )
         number = None if terms is None else int(terms)
         return Asked(*pattern, square_m, model, number, board_shape, compare, folds)
+
+    @property
+    def pattern(self) -> BoardPattern:
+        """The board; squares of 1 where none were measured."""
+        return BoardPattern(self.columns, self.rows, self.square_m or 1.0)
 
     @property
     def free_to_choose(self) -> bool:

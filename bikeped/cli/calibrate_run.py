@@ -111,9 +111,8 @@ def run(
             "--live"
         )
     loaded = camera_config(config_path, overrides)
-    pattern = BoardPattern(asked.columns, asked.rows, asked.square_m or 1.0)
     pictures = load_pictures(images)
-    found = _boards(pictures, pattern)
+    found = _boards(pictures, asked.pattern)
     sensor = framing(loaded)
     size = (pictures[0].width, pictures[0].height)
     framed = sensor if size == (sensor.sensor_w, sensor.sensor_h) else None

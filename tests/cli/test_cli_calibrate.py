@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -166,7 +167,8 @@ def one(folder: Path, pictures: Path) -> list[object]:
 
 def alike(folder: Path, pictures: Path) -> list[object]:
     pose = spread_poses(CAMERA, PATTERN, 8, seed=3, span_deg=(45, 75))[1]
-    draw(folder, CAMERA, [pose] * 4)
+    poses = [replace(pose, translation_m=pose.translation_m * (1 + 0.02 * n)) for n in range(4)]
+    draw(folder, CAMERA, poses)
     return [folder]
 
 
@@ -243,6 +245,35 @@ def test_a_wrong_pattern_is_refused(calibrate: Run, pictures: Path) -> None:
     assert list(Path().iterdir()) == []
 
 
+def test_a_board_to_print(calibrate: Run) -> None:
+    status, out, err = calibrate("--board", "b.pdf", "--pattern", "8x6", "--page", "a3")
+    assert status == 0, err
+    assert Path("b.pdf").read_bytes().startswith(b"%PDF")
+    assert "squares of " in out
+    status, _, err = calibrate("--board", "c.pdf", "--pattern", "8x6", "--square", "0.2")
+    assert status == 2
+    assert "--square" in err
+    assert not Path("c.pdf").exists()
+
+
+def test_live_guides_keeps_and_calibrates(calibrate: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "camera"
+    folder.mkdir()
+    poses = spread_poses(CAMERA, PATTERN, 5, seed=3, span_deg=(45, 75))
+    # Each board is held still for two frames.
+    draw(folder, CAMERA, [pose for pose in poses for _ in range(2)])
+    settings = [f"camera.source={folder}", "camera.width=480", "camera.height=480"]
+    settings += ["camera.pad_size=null", "camera.crop_size=null", "web.port=0"]
+    given = [part for setting in settings for part in ("--set", setting)]
+    status, out, err = calibrate(
+        "taken", "--live", "--pattern", "8x6", "--terms", "0", "--out", "lens.json", *given
+    )
+    assert status == 0, err
+    assert len(list(Path("taken").glob("board-*.png"))) == 5
+    assert "kept as board 1" in out
+    assert json.loads(Path("lens.json").read_text())["focal_length"] == pytest.approx(150, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -257,6 +288,8 @@ def test_a_wrong_pattern_is_refused(calibrate: Run, pictures: Path) -> None:
         (["{pictures}", "--pattern", "8x6", "--report", "{pictures}/board00.png"], "--report"),
         (["{pictures}", "--pattern", "8x6", "--report", "a", "--json", "a"], "own file"),
         (["{pictures}", "--pattern", "8x6", "-c", "nothing.yaml"], "nothing.yaml"),
+        (["a", "b", "--live", "--pattern", "8x6"], "one folder"),
+        (["--board", "no/such/b.pdf", "--pattern", "8x6"], "--board"),
     ],
 )
 def test_wrong_options_are_refused_in_one_line(
