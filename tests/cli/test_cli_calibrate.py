@@ -238,7 +238,7 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line(
 
 
 def test_a_wrong_pattern_is_refused(calibrate: Run, pictures: Path) -> None:
-    status, _, err = calibrate(pictures, "--pattern", "11x9")
+    status, _, err = calibrate(min(pictures.iterdir()), "--pattern", "11x9")
     assert status == 2
     assert "no board of 11x9" in err
     assert "--pattern" in err
