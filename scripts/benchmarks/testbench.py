@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from bench import Figures
 
-MOVES = 30
+MOVES = 15
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
 #: What is moved, and between which values.
 KNOBS = (

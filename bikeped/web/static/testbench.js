@@ -11,8 +11,8 @@ import { configurationName } from "/static/testbench-words.js";
 
 const CLIENT = crypto.randomUUID?.().slice(0, 36) ?? String(Math.random());
 const app = { about: null, bench: null, play: null, suite: null, own: new Map(), editing: false };
-const REST_MS = 120;
-let show, knobs, diagram, edits, suite, resting = 0;
+const REST_MS = 80;
+let show, knobs, diagram, edits, suite, resting = 0, due = null;
 
 // --- asking: one request of a kind on its way, of those that wait only the newest
 
@@ -30,7 +30,10 @@ function newest(kind, take, told) {
       if (error.status === 503) {
         next ??= job;
         await new Promise((wait) => setTimeout(wait, 1000));
-      } else if (error.status !== 409) failed(error);
+      } else if (error.status !== 409) {
+        failed(error);
+        if (kind === "scenario") { due = null; $("#tb").dataset.suite = "failed"; }
+      }
     }
     busy = false;
     if (next) { const job = next; next = null; send(job); }
@@ -55,6 +58,7 @@ const askScenario = newest("scenario", (data, job) => {
   rememberLink(data.link);
   document.documentElement.dataset.ready = "testbench";
   measured("bench:scenario", job);
+  if (job.bench === app.bench) drawn();
 }, $("#busy"));
 
 const askSuite = newest("suite", (data, job) => {
@@ -91,12 +95,17 @@ function change(bench, { scenarioOnly = false } = {}) {
   showPicks();
   askScenario(bench);
   if (scenarioOnly) return;
-  // The suite follows when the hand rests.
-  const began = performance.now();
+  // The suite follows when the scenario is drawn and the hand rests.
   app.wanted = bench;
+  due = { bench, began: performance.now() };
   clearTimeout(resting);
   $("#tb").dataset.suite = "waiting";
-  resting = setTimeout(() => askSuite(bench, began), REST_MS);
+}
+
+function drawn() {
+  if (!due) return;
+  clearTimeout(resting);
+  resting = setTimeout(() => { const { bench, began } = due; due = null; askSuite(bench, began); }, REST_MS);
 }
 
 function choose(name) {
