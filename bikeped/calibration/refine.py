@@ -1,7 +1,7 @@
 """Corners to hundredths of a pixel: two blurred edges that cross, fitted to the picture itself.
 
 The gradient method of cv2.cornerSubPix takes edges for straight lines and its window for square; on
-drawn fisheye boards it is off by 0.045 px where this is by 0.011 (tests/calibration). Here each
+drawn boards that fill a fisheye it is off by 0.038 px where this is by 0.016. Here each
 corner's own neighbours say how the two edges bend and how large a square is along either, the
 window is a share of that square, and position, directions, blur and brightness are fitted to the
 pixels as they are, without interpolation:
@@ -24,8 +24,8 @@ from bikeped.calibration.grid import LocalMap, local_map
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
 _SHARE = 0.3  # of a square, to either side of the corner ...
-_SMALL_PX = 5.0  # ... but at least this many pixels, as long as
-_SHARE_MOST = 0.45  # the next edge stays out of the window
+_SMALL_PX = 6.0  # ... but at least this many pixels, as long as
+_SHARE_MOST = 0.6  # the next edge, smoothed, stays out of the window
 _SAMPLES = 10  # pixels to either side, at most; of wider windows only the edges' surroundings ...
 _ALONG = 14  # ... at this many places to either side
 _BLUR_PX = 0.7  # what a sharp picture has
@@ -35,7 +35,7 @@ _DONE_PX = 0.002
 _NOISE = 0.05
 _PRIOR_ANGLE = 0.08
 _PRIOR_BLUR = 0.4  # of its logarithm
-_PRIOR_SLOPE = 0.2
+_PRIOR_SLOPE = 0.05
 _PRIOR_BLEED = 0.1
 _ROOT = np.sqrt(2.0)
 

@@ -16,7 +16,7 @@ from bikeped.calibration.views import BoardPattern
 from bikeped.types import FloatArray, ImageArray
 
 _ROWS_AT_ONCE = 128
-_STEPS = 4  # of the fixed point that finds a bent board along a ray: a bend of 5 % is a flat one
+_STEPS = 8  # of the fixed point that finds a bent board along a ray
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bikeped.calibration.refine import refine
+from bikeped.calibration.render import Look, draw_picture
 from bikeped.calibration.synthetic import (
     BoardBend,
+    BoardPose,
     DrawnCamera,
     draw_views,
     spread_poses,
@@ -99,3 +102,63 @@ def test_a_span_wider_than_the_lens_is_refused() -> None:
     camera = DrawnCamera(Lens.from_circle("equidistant", 400, 60), 400, 400, 801, 801)
     with pytest.raises(GeometryError, match="has no place"):
         spread_poses(camera, PATTERN, 3, span_deg=(100, 120))
+
+
+def test_a_drawn_picture_shows_what_the_corners_say() -> None:
+    """Between the corners lie the squares, dark and light in turn; beyond the circle, nothing."""
+    camera = DrawnCamera(Lens.from_circle("equidistant", 300, 200), 303.0, 297.0, 600, 600)
+    for number, pose in enumerate(spread_poses(camera, PATTERN, 4, margin_px=8)):
+        picture = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0, blur_px=0.4))
+        corners = true_corners(camera, PATTERN, pose)[0].reshape(6, 8, 2)
+        middle = (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]) / 4
+        at = np.rint(middle).astype(int)
+        level = picture[at[..., 1], at[..., 0]]
+        dark = (np.arange(5)[:, None] + np.arange(7)) % 2 == 0
+        assert level[dark].max() < 80 < 160 < level[~dark].min(), number
+        assert picture[2, 2] == 0  # outside the image circle
+
+
+def test_a_drawn_pixel_on_an_edge_is_the_share_of_either_side() -> None:
+    """Face on in an almost straight lens, an edge that cuts pixels at 0.3: 0.3 dark, 0.7 light."""
+    camera = DrawnCamera(Lens.from_circle("equidistant", 4000, 20), 100.0, 100.0, 201, 201)
+    plain = Look(black=0, white=200, noise=0, blur_px=0, shade=0, samples=20)
+    # 100 px a square: the corner's edge u = 100 + 0.8 cuts pixel 101 (100.5 to 101.5) at 0.3.
+    focal = camera.lens.focal_px
+    square = 100 / focal
+    pattern = BoardPattern(3, 3, square)
+    pose = BoardPose(np.eye(3), np.array([0.8 / focal, 0.0, 1.0]))
+    picture = draw_picture(camera, pattern, pose, look=plain)
+    assert picture[150, 95] == picture[150, 100]
+    sides = float(picture[150, 95]), float(picture[150, 106])
+    assert sorted(sides) == [0, 200]
+    assert picture[150, 101] == pytest.approx(0.3 * sides[0] + 0.7 * sides[1], abs=11)
+
+
+def test_noise_blur_occlusion_and_shade_do_what_they_say() -> None:
+    camera = DrawnCamera(Lens.from_circle("equidistant", 300, 200), 299.5, 299.5, 600, 600)
+    pose = BoardPose(np.eye(3), np.array([0.0, 0.0, 0.3]))
+    clean = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0)).astype(float)
+    noisy = draw_picture(camera, PATTERN, pose, look=Look(noise=4, shade=0)).astype(float)
+    middle = (slice(250, 350), slice(250, 350))
+    assert np.std((noisy - clean)[middle]) == pytest.approx(4, rel=0.05)
+    soft = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0, blur_px=3)).astype(float)
+    assert np.abs(np.diff(soft[middle])).max() < 0.4 * np.abs(np.diff(clean[middle])).max()
+    hidden = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0, occluded=0.4))
+    share = np.mean(np.abs(hidden.astype(float) - clean) > 50)
+    assert 0.005 < share < 0.2
+    shaded = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0.5))
+    rim = int(299.5 + 0.95 * camera.lens.max_radius_px)
+    assert shaded[300, rim] < 0.65 * clean[300, rim]
+
+
+def test_a_bend_is_drawn_where_the_corners_say() -> None:
+    camera = DrawnCamera(Lens.from_circle("equidistant", 300, 200), 299.5, 299.5, 600, 600)
+    bend = BoardBend(along_columns=0.5, along_rows=-0.3, twist=0.2)
+    pose = BoardPose(turn([0.3, -0.5, 0.2]), np.array([0.05, 0.0, 0.25]))
+    picture = draw_picture(camera, PATTERN, pose, look=Look(noise=0, samples=6), bend=bend)
+    truth, _ = true_corners(camera, PATTERN, pose, bend)
+    flat, _ = true_corners(camera, PATTERN, pose)
+    seen = np.stack([np.arange(48) % 8, np.arange(48) // 8], axis=1).astype(np.float64)
+    refined = refine(picture, seen, truth).uv_px
+    assert np.linalg.norm(refined - truth, axis=1).max() < 0.12
+    assert np.linalg.norm(refined - flat, axis=1).max() > 2

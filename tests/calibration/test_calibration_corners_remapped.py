@@ -1,0 +1,85 @@
+"""Remapped views: corners found in them come back to the pixels that they were taken from."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from bikeped.calibration import detect_remapped
+from bikeped.calibration.corners import find_board
+from bikeped.calibration.detect_raw import at_scale
+from bikeped.calibration.detect_remapped import GAZES, Gaze, positions
+from bikeped.calibration.render import draw_picture
+from bikeped.calibration.synthetic import BoardPose, DrawnCamera, true_corners
+from bikeped.calibration.views import BoardPattern
+from bikeped.geometry import Lens
+from bikeped.types import FloatArray, ImageArray
+
+PATTERN = BoardPattern(8, 6, 0.04)
+LENS = Lens.from_circle("equidistant", 320, 190)
+CAMERA = DrawnCamera(LENS, 319.5, 239.5, 640, 480)
+
+
+@pytest.mark.parametrize("gaze", [GAZES[0], GAZES[2], GAZES[3], GAZES[-1]])
+def test_the_middle_of_a_view_is_where_it_looks(gaze: Gaze) -> None:
+    at = positions(gaze, 640, 480)
+    middle = at[399:401, 399:401].mean((0, 1)) - [319.5, 239.5]
+    theta = math.radians(gaze.away_deg)
+    about = math.radians(gaze.round_deg)
+    expected = float(LENS.radius(theta)) * np.array([math.cos(about), math.sin(about)])
+    np.testing.assert_allclose(middle, expected, atol=1.0)
+
+
+def test_a_perspective_view_keeps_straight_lines_straight() -> None:
+    """Three corners of one row of a board: in the view they lie on a line, in the picture not."""
+    at = positions(Gaze(0, 0, 110), 640, 480)
+    row = at[100].astype(np.float64)
+    rays = CAMERA.rays(row[::80])
+    plane = np.linalg.svd(rays)[2][-1]
+    assert np.abs(rays @ plane).max() < 1e-3
+    assert np.ptp(row[:, 1]) > 20
+
+
+def test_boards_are_found_when_the_picture_itself_gives_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "bikeped.calibration.corners.raw_candidates", lambda grey, pattern: iter(())
+    )
+    for pose in (
+        BoardPose(np.eye(3), np.array([0.0, 0.0, 0.13])),  # close: it fills the view
+        BoardPose(np.eye(3), np.array([0.2, -0.1, 0.3])),
+    ):
+        seen = find_board(draw_picture(CAMERA, PATTERN, pose), PATTERN)
+        assert seen.board is not None, seen.why
+        truth, _ = true_corners(CAMERA, PATTERN, pose)
+        np.testing.assert_allclose(seen.board.uv_px, truth[seen.board.ids], atol=0.2)
+
+
+def test_the_views_are_tried_only_as_far_as_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[int] = []
+
+    def third(grey: ImageArray, pattern: BoardPattern) -> FloatArray | None:
+        tried.append(grey.shape[0])
+        return np.full((48, 2), 399.5) if len(tried) == 3 else None
+
+    monkeypatch.setattr(detect_remapped, "classic", third)
+    grey = np.zeros((480, 640), np.uint8)
+    first = next(detect_remapped.remapped_candidates(grey, PATTERN))
+    np.testing.assert_allclose(first, np.full((48, 2), [319.5, 239.5]), atol=0.01)
+    assert len(tried) == 3
+
+
+def test_a_scaled_search_answers_in_pixels_of_the_picture() -> None:
+    def corner_of_white(grey: ImageArray, pattern: BoardPattern) -> FloatArray:
+        rows, columns = np.nonzero(grey > 127)
+        return np.array([[columns.min() - 0.5, rows.min() - 0.5]])
+
+    picture = np.zeros((200, 320), np.uint8)
+    picture[80:, 120:] = 255
+    for scale in (0.25, 0.5, 1.0, 2.0):
+        found = at_scale(corner_of_white, picture, PATTERN, scale)
+        assert found is not None
+        np.testing.assert_allclose(found, [[119.5, 79.5]], atol=0.01)

@@ -1,0 +1,230 @@
+"""The guide before a camera: what it keeps, what it says, and how the page shows it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestClient, TestServer
+
+from bikeped.calibration.coverage import Coverage, Part, cover, empty_parts
+from bikeped.calibration.live import Answer, Guide
+from bikeped.calibration.live_page import LivePage, live_routes
+from bikeped.calibration.live_session import LiveSession, assumed_lens, capture_boards
+from bikeped.calibration.render import draw_picture
+from bikeped.calibration.synthetic import BoardPose, DrawnCamera, draw_views, spread_poses
+from bikeped.calibration.views import BoardPattern, BoardView
+from bikeped.capture import FrameSource
+from bikeped.errors import CalibrationError, CaptureError
+from bikeped.geometry import Lens
+from bikeped.types import Frame, ImageArray
+
+PATTERN = BoardPattern(7, 6, 0.04)
+SIDE = 480
+CAMERA = DrawnCamera(Lens.from_circle("equidistant", 236, 190), 241.0, 238.0, SIDE, SIDE)
+
+
+def guide() -> Guide:
+    lens, centre = assumed_lens(SIDE, SIDE)
+    return Guide(PATTERN, SIDE, SIDE, lens, centre)
+
+
+def board(x_m: float = 0.0, y_m: float = 0.0, seed: int = 0) -> ImageArray:
+    pose = BoardPose(np.eye(3), np.array([x_m, y_m, 0.25]))
+    return draw_picture(CAMERA, PATTERN, pose, seed=seed)
+
+
+class Recording(FrameSource):
+    """Frames from memory; `live` ones block for ever after the last."""
+
+    def __init__(self, pictures: list[ImageArray | None], *, live: bool = False) -> None:
+        self.name, self.width, self.height, self.fps, self.live = "drawn", SIDE, SIDE, 10.0, live
+        self._pictures = pictures
+        self._number = 0
+        self.closed = threading.Event()
+
+    def read(self) -> Frame | None:
+        if self._number == len(self._pictures):
+            return None
+        picture = self._pictures[self._number]
+        if picture is None:
+            raise CaptureError("drawn: unplugged")
+        self._number += 1
+        rgb = np.repeat(picture[..., None], 3, axis=2)
+        return Frame(self._number, self._number / 10, picture.shape[1], picture.shape[0], None, rgb)
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+def test_a_board_is_kept_once_it_is_still_and_only_once() -> None:
+    guided = guide()
+    answers = [
+        guided.look(np.full((SIDE, SIDE), 90, np.uint8), 0.0),
+        guided.look(board(seed=1), 0.2),
+        guided.look(board(0.08, seed=2), 0.4),
+        guided.look(board(0.08, seed=3), 0.6),
+        guided.look(board(0.08, seed=4), 0.8),
+        guided.look(board(-0.1, seed=5), 5.0),
+        guided.look(board(-0.1, seed=6), 9.0),  # too long after the last look
+        guided.look(board(-0.1, seed=7), 9.2),
+    ]
+    assert [one.answer for one in answers] == [
+        Answer.NO_BOARD,
+        Answer.MOVING,
+        Answer.MOVING,
+        Answer.KEPT,
+        Answer.SEEN,
+        Answer.MOVING,
+        Answer.MOVING,
+        Answer.KEPT,
+    ]
+    assert len(guided.kept) == 2
+    assert answers[3].uv_px.shape == (42, 2)
+    assert len(answers[0].uv_px) == 0
+
+
+def test_a_blurred_board_is_not_kept() -> None:
+    guided = guide()
+    sharp = board(0.08)
+    guided.look(sharp, 0.0)
+    blurred = np.asarray(cv2.GaussianBlur(board(-0.1), (0, 0), 2.2), np.uint8)
+    assert guided.look(blurred, 0.2).answer is Answer.BLURRED
+    assert guided.look(blurred, 0.4).answer is Answer.BLURRED
+    assert not guided.kept
+
+
+def test_it_says_when_there_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    guided = guide()
+    views = draw_views(CAMERA, PATTERN, spread_poses(CAMERA, PATTERN, 60, span_deg=(40, 70)))
+    guided.kept = views[:5]
+    guided.coverage = guided._cover()
+    assert not guided.enough
+    assert "hold the board there" in guided.advice
+    guided.kept = views
+    guided.coverage = guided._cover()
+    assert guided.coverage.share > 0.85
+    assert guided.enough
+    assert guided.advice.startswith("enough: 60 boards")
+
+
+def test_an_empty_circle_is_all_gaps_and_words_point_the_right_way() -> None:
+    lens = Lens.from_circle("equidistant", 500, 190)
+    window = (0.0, 0.0, 1001.0, 1001.0)
+    assert cover([], lens, (500, 500), window).share == 0
+    ids = np.arange(16, dtype=np.int64)
+    spots = {"upper left": (-1, -1), "right": (1, 0), "bottom": (0, 1)}
+    for way, (x, y) in spots.items():
+        unit = np.array([x, y]) / math.hypot(x, y)
+        uv = 500 + 440 * unit + np.random.default_rng(0).uniform(-20, 20, (16, 2))
+        view = BoardView("a", ids, uv, 1001, 1001)
+        covered = cover([view, view], lens, (500, 500), window)
+        hit = [part.where for part in covered.parts if part.covered]
+        assert hit == [f"{way}, at the rim"]
+        assert not any(line.startswith(f"{way}, at the rim") for line in covered.advice(40))
+
+
+def test_parts_tile_the_circle_and_stay_on_the_picture() -> None:
+    lens = Lens.from_circle("equisolid", 500, 190)
+    parts = empty_parts(lens, (500, 500), (0, 0, 1001, 1001))
+    solid = sum(
+        (math.cos(p.from_rad) - math.cos(p.to_rad)) * (p.stop_rad - p.start_rad) for p in parts
+    )
+    assert solid == pytest.approx(2 * math.pi * (1 - math.cos(math.radians(95))), rel=1e-9)
+    low = empty_parts(lens, (500, 500), (0, 200, 1001, 801))
+    assert len(low) < len(parts)
+    assert not any(part.where == "top, at the rim" for part in low)
+
+
+def test_the_emptiest_part_comes_first() -> None:
+    def part(corners: int, to_rad: float, where: str) -> Part:
+        return Part(0.0, to_rad, 0.0, 1.0, where, corners, 2)
+
+    coverage = Coverage(
+        [part(11, 1.0, "a"), part(0, 1.0, "b"), part(0, 1.5, "c"), part(20, 1, "d")]
+    )
+    assert [one.where for one in coverage.gaps] == ["c", "b", "a"]
+    assert coverage.share == 0.25
+    advice = coverage.advice(1)
+    assert len(advice) == 1
+    assert advice[0].startswith("c (0 to 86 degrees from the axis): no corner yet; hold the board")
+
+
+def test_a_capture_saves_what_it_keeps_beside_what_is_there(tmp_path: Path) -> None:
+    (tmp_path / "board-001.png").write_bytes(b"mine")
+    frames = [board(0.08, seed=1), board(0.08, seed=2), board(-0.1, seed=3), board(-0.1, seed=4)]
+    guided = guide()
+    session = LiveSession(guided)
+    lines: list[str] = []
+    saved = capture_boards(Recording([*frames]), guided, tmp_path, session, say=lines.append)
+    assert [path.name for path in saved] == ["board-002.png", "board-003.png"]
+    assert (tmp_path / "board-001.png").read_bytes() == b"mine"
+    np.testing.assert_array_equal(cv2.imread(str(saved[0]), cv2.IMREAD_GRAYSCALE), frames[1])
+    assert any(line.startswith("kept as board 2: board-003.png") for line in lines)
+    assert session.stopped
+    assert session.status()["kept"] == 2
+    shown = cv2.imdecode(np.frombuffer(session.picture()[1], np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    assert shown.shape == (SIDE, SIDE, 3)
+
+
+def test_a_live_source_that_breaks_or_has_another_size_ends_the_capture(tmp_path: Path) -> None:
+    guided = guide()
+    with pytest.raises(CaptureError, match="unplugged"):
+        capture_boards(Recording([board(), None], live=True), guided, tmp_path, LiveSession(guided))
+    small = np.zeros((100, 100), np.uint8)
+    with pytest.raises(CalibrationError, match="100x100 pixels instead of 480x480"):
+        capture_boards(Recording([small]), guided, tmp_path, LiveSession(guided))
+
+
+async def test_the_page_tells_and_streams() -> None:
+    guided = guide()
+    session = LiveSession(guided)
+    picture = board()
+    session.show(picture, guided.look(picture, 0.0))
+    app = web.Application()
+    app.add_routes(live_routes(session))
+    async with TestClient(TestServer(app)) as client:
+        page = await (await client.get("/calibrate")).text()
+        assert 'src="calibrate/stream"' in page
+        status = await (await client.get("/calibrate/status")).json()
+        assert status["says"] == "a board: hold it still"
+        assert status["kept"] == 0
+        assert status["next"] == guided.advice
+        assert len(status["parts"]) == len(guided.coverage.parts)
+        stream = await client.get("/calibrate/stream")
+        start = await stream.content.readuntil(b"\r\n\r\n")
+        assert b"image/jpeg" in start
+        assert await stream.content.readexactly(2) == b"\xff\xd8"
+        session.stop()
+        await stream.release()
+
+
+async def test_the_page_of_its_own_serves_this_machine_only() -> None:
+    session = LiveSession(guide())
+    with LivePage(session, port=0) as page:
+        assert page.url is not None
+        port = int(page.url.split(":")[2].split("/")[0])
+        for host, expected in (("localhost", b"200"), ("evil.example", b"403")):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            head = f"Host: {host}:{port}\r\nConnection: close\r\n\r\n"
+            writer.write(f"GET /calibrate/status HTTP/1.1\r\n{head}".encode())
+            answer = await reader.read()
+            writer.close()
+            await writer.wait_closed()
+            assert answer.split(b" ", 2)[1] == expected
+            if expected == b"200":
+                assert (
+                    json.loads(answer.split(b"\r\n\r\n", 1)[1])["says"] == "waiting for the camera"
+                )
+        with LivePage(LiveSession(guide()), port=port) as second:
+            assert second.url is None
+            assert "set web.port" in str(second.error)
+    assert session.stopped
