@@ -64,7 +64,7 @@ def test_the_colours_are_chosen_and_remembered(url, open_page):
     page.reload()
     assert page.get_attribute("html", "data-theme") == "dark"
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(16, 20, 23)"
-    page.click("nav >> text=Align")
+    page.goto(f"{url}/align")
     assert page.get_attribute("html", "data-theme") == "dark"
 
 
