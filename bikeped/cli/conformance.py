@@ -14,6 +14,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.conformance_governance import add_commands
+from bikeped.cli.conformance_pixels import command as pixels
 from bikeped.cli.conformance_shared import (
     begin,
     burst_option,
@@ -42,6 +43,7 @@ def command() -> None:
 
 
 add_commands(command)
+command.add_command(pixels)
 
 
 @command.command("run")

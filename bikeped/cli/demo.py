@@ -1,4 +1,4 @@
-"""`bikeped demo`: a drawn crossing through the whole loop; needs no camera, model or broker."""
+"""`bikeped demo`: a drawn crossing through the whole loop; needs no camera and no broker."""
 
 from __future__ import annotations
 
@@ -16,9 +16,12 @@ from bikeped.cli.common import (
 )
 from bikeped.cli.guard import guarded
 from bikeped.cli.web_options import open_pages, web_option, web_overrides
-from bikeped.config import framing, ground_camera, load_config
+from bikeped.config import load_config
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
+
+SIZE = (1920, 1080)
+FPS = 30
 
 
 @click.command("demo")
@@ -46,17 +49,15 @@ def command(
     web_place: str | None,
     json_path: str | None,
 ) -> None:
-    """Draw a scripted crossing as fisheye video and run it through the whole loop."""
+    """Draw a scripted crossing as fisheye video and run it through the whole loop.
+
+    Without a configured detector the bundled one looks at the pictures.
+    """
     from bikeped.conformance.scenario import load_scenario
-    from bikeped.demo import (
-        DrawnBoxDetector,
-        bundled_scenario,
-        format_summary,
-        sidecar_path,
-        summarise,
-        write_clip,
-    )
-    from bikeped.service.drawn import DrawnEye
+    from bikeped.demo import bundled_scenario, format_summary, summarise
+    from bikeped.models import BUNDLED, NOT_FOR_STREETS
+    from bikeped.scene import Conditions, ScenePainter, scene_camera
+    from bikeped.scene.clip import frame_times, write_clip
     from bikeped.service.replay import ReplayFiles, replay
 
     if seconds is not None and not math.isfinite(seconds):
@@ -64,26 +65,20 @@ def command(
     if web_place is not None:
         overrides += web_overrides(web_place)
     loaded = load_config(config_path, overrides)
+    if loaded.config.detection.model is None:
+        loaded = load_config(config_path, (f"detection.model={BUNDLED}", *overrides))
     pages = None if web_place is None else open_pages(loaded)
     make_folder(out)
     scenario = load_scenario(bundled_scenario())
     clip, events, overlay = out / "crossing.avi", out / "events.jsonl", out / "overlay.mp4"
-    times = scenario.frame_times()
-    frames = len(times) if seconds is None else int((times < seconds).sum())
+    painter = ScenePainter(scenario, scene_camera(loaded, SIZE), Conditions())
+    frames = len(frame_times(painter, FPS, seconds))
     with progress_bar("drawing", frames) as tell:
-        write_clip(
-            scenario,
-            clip,
-            ground_camera(loaded),
-            framing(loaded),
-            seconds=seconds,
-            progress=lambda done, _: tell(done),
-        )
+        write_clip(painter, clip, fps=FPS, seconds=seconds, progress=lambda done, _: tell(done))
     with progress_bar("replaying", frames) as tell:
         result = replay(
             loaded,
             str(clip),
-            eye=DrawnEye(DrawnBoxDetector(sidecar_path(clip))),
             files=ReplayFiles(events, overlay),
             realtime=pages is not None,
             mqtt=False,
@@ -93,6 +88,7 @@ def command(
     lines = [json.loads(line) for line in events.read_text(encoding="utf-8").splitlines()]
     summary = {
         **summarise(lines, scenario.name),
+        "notice": NOT_FOR_STREETS if loaded.config.detection.model == BUNDLED else None,
         "config_hash": loaded.hash,
         "detector": result.detector,
         "latency_ms": result.as_dict()["latency_ms"],

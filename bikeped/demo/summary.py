@@ -6,10 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-NOTICE = (
-    "No detector model is bundled with bikeped yet: the detections of this demo were simulated "
-    "from the boxes of the drawn road users, not found in the pictures."
-)
 #: ALERTs of one pair this close together are one alert, as a person would count them.
 MERGE_S = 1.0
 _STATES = ("IDLE", "SAFE", "WARNING", "ALERT")
@@ -36,8 +32,6 @@ def summarise(events: Sequence[Event], scenario: str = "") -> dict[str, Any]:
         if not order or order[-1] != event["state"]:
             order.append(str(event["state"]))
     return {
-        "notice": NOTICE,
-        "detections": "simulated",
         "scenario": scenario,
         "frames": count,
         "duration_s": round(float(frames[-1]["t"] - frames[0]["t"]), 3) if count else 0.0,
@@ -67,7 +61,8 @@ def format_summary(summary: Mapping[str, Any]) -> str:
                 f"              {alert['lead_s']:.1f} s before the closest approach "
                 f"({alert['closest_m']:.1f} m)"
             )
-    lines += ["", f"  {summary['notice']}"]
+    lines += ["", f"  detector: {summary['detector']}"] if summary.get("detector") else []
+    lines += [f"  {summary['notice']}"] if summary.get("notice") else []
     return "\n".join(lines) + "\n"
 
 

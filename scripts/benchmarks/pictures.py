@@ -8,19 +8,13 @@ from functools import cache
 @cache
 def street_4k(count: int) -> list[bytes]:
     """`count` frames of the demo's crossing at 3840 x 2160, spread over its length."""
-    import simplejpeg
-
-    from bikeped.config import framing, ground_camera, load_config
+    from bikeped.config import load_config
     from bikeped.conformance.scenario import load_scenario
-    from bikeped.demo import DEMO_POSE, Scene, bundled_scenario
+    from bikeped.demo import bundled_scenario
+    from bikeped.scene import Conditions, ScenePainter, scene_camera
+    from bikeped.scene.clip import encode_jpeg
 
-    loaded = load_config()
     scenario = load_scenario(bundled_scenario())
-    scene = Scene(scenario, ground_camera(loaded), framing(loaded), DEMO_POSE, (3840, 2160))
+    painter = ScenePainter(scenario, scene_camera(load_config(), (3840, 2160)), Conditions())
     step = scenario.duration_s / max(count, 2)
-    return [
-        simplejpeg.encode_jpeg(
-            scene.frame(i * step + step / 2), quality=90, colorspace="RGB", colorsubsampling="420"
-        )
-        for i in range(count)
-    ]
+    return [encode_jpeg(painter.frame(i * step + step / 2), 90) for i in range(count)]

@@ -17,9 +17,10 @@ import cv2
 import numpy as np
 
 from bikeped.config import framing, ground_camera, load_config
-from bikeped.demo.pen import Eye
-from bikeped.demo.street import background
+from bikeped.conformance.scenario import load_scenario
+from bikeped.demo import bundled_scenario
 from bikeped.geometry import CameraPose
+from bikeped.scene import Conditions, SceneCamera, ScenePainter
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -85,7 +86,8 @@ def _draw(config: Path, picture: Path) -> Path:
     loaded = load_config(config)
     frame = framing(loaded).for_frame(3840, 2160)
     camera = replace(ground_camera(loaded), height_m=4.21, pitch_deg=-7.3)
-    image, _ = background(Eye(camera, CameraPose(5, -13, 90), frame), 3840, 2160)
+    eye = SceneCamera(camera, frame, CameraPose(5, -13, 90), (3840, 2160))
+    image = ScenePainter(load_scenario(bundled_scenario()), eye, Conditions()).frame(0.0).copy()
     marks = []
     for number, (x, y) in enumerate(AT_M, 1):
         for way in (1, -1):

@@ -1,18 +1,14 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from test_demo_scene import CAMERA, FRAMING
+from drawn_eyes import boxes
 
 from bikeped.config import load_config
-from bikeped.config.build import rule_settings, tracker_settings
 from bikeped.conformance.scenario import load_scenario
-from bikeped.decision import Decider
-from bikeped.demo import DEMO_POSE, Scene, bundled_scenario, format_summary, summarise
-from bikeped.demo.detector import _KIND
-from bikeped.tracking import Tracker
-from bikeped.types import Detections, GroundPoints
+from bikeped.demo import bundled_scenario, format_summary, summarise
+from bikeped.scene import Conditions, ScenePainter, scene_camera
+from bikeped.service.judge import Judge
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 
@@ -69,44 +65,32 @@ def test_coasting_does_not_count_as_the_closest_approach():
     assert summarise(events)["alerts"][0]["closest_m"] == 9.0
 
 
-def test_text_says_that_detections_are_simulated():
-    text = format_summary(
-        summarise([event(0.0, "ALERT", [2, 1]), event(0.5, "ALERT", [2, 1], 4.0)])
-    )
-    assert "No detector model is bundled" in text
-    assert "simulated" in text
+def test_text_says_what_looked_and_what_it_must_not_be_used_for():
+    summary = summarise([event(0.0, "ALERT", [2, 1]), event(0.5, "ALERT", [2, 1], 4.0)])
+    text = format_summary(summary)
     assert "0.5 s before the closest approach (4.0 m)" in text
+    assert "detector" not in text
+    text = format_summary({**summary, "detector": "small.onnx", "notice": "not for a street"})
+    assert "detector: small.onnx" in text
+    assert "not for a street" in text
     assert format_summary(summarise([]))
 
 
 def test_the_story_passes_through_all_four_states():
-    """Boxes, ground, tracker and rule with the shipped configuration; no pictures needed."""
+    """Exact boxes, ground, tracker and rule with the shipped configuration; no pictures needed."""
     loaded = load_config(CONFIG)
-    tracker = Tracker(tracker_settings(loaded.config.tracking))
-    decider = Decider(rule_settings(loaded.config.decision))
     scenario = load_scenario(bundled_scenario())
-    scene = Scene(scenario, CAMERA, FRAMING, DEMO_POSE, (320, 180))
-    # Boxes do not depend on the pictures: those of the full frame, without drawing it.
-    scene.size = (1920, 1080)
-    scene.eye = type(scene.eye)(CAMERA, DEMO_POSE, FRAMING.for_frame(1920, 1080))
+    painter = ScenePainter(scenario, scene_camera(loaded, (1920, 1080)), Conditions())
+    judge = Judge(loaded)
     events = []
     for number, t in enumerate(scenario.frame_times(30).tolist()):
-        found = scene.objects(t)
-        detections = Detections(
-            np.array([_KIND[o.kind] for o in found], np.int8),
-            np.full(len(found), 0.9, np.float32),
-            np.array([o.box_px for o in found], np.float32).reshape(-1, 4),
-        )
-        xy, valid = CAMERA.ground(scene.eye.framing.frame_to_crop(detections.bottom_centre_px()))
-        index = np.flatnonzero(valid).astype(np.int64)
-        tracks = tracker.update(GroundPoints(detections.kind[index], xy[index], index), t)
-        decision = decider.step(t, tracks.id, tracks.kind, tracks.xy_m)
-        pair = decision.pair
+        found = judge.judge(boxes(painter.objects(t)), 1920, 1080, t + 1e-9, 0.0)
+        tracks, pair = found.tracks, found.decision.pair
         events.append(
             {
                 "t": t,
                 "frame": number,
-                "state": decision.state.name,
+                "state": found.decision.state.name,
                 "pair": [pair.cyclist_id, pair.pedestrian_id] if pair else None,
                 "tracks": [
                     {"id": i, "x": x, "y": y, "lost": u > 0}
@@ -123,5 +107,5 @@ def test_the_story_passes_through_all_four_states():
     assert summary["state_order"] == ["IDLE", "SAFE", "WARNING", "ALERT", "WARNING"]
     assert min(summary["state_share"].values()) > 0.05
     (alert,) = summary["alerts"]
-    assert alert["lead_s"] > 3.0
+    assert alert["lead_s"] > 2.5
     assert alert["closest_m"] > 2.0, "the warned cyclist keeps clear"

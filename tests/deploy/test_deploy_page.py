@@ -16,7 +16,17 @@ PAGE = (Path(__file__).parents[2] / "docs" / "install-on-a-pole.md").read_text()
 KEYS = sorted(
     set(re.findall(r"`((?:camera|detection|feedback|mqtt|audit)(?:\.[a-z]\w*)+)(?:: \w+)?`", PAGE))
 )
-COMMANDS = {"align", "run", "replay", "demo", "config", "doctor", "calibrate", "conformance", "model"}
+COMMANDS = {
+    "align",
+    "run",
+    "replay",
+    "demo",
+    "config",
+    "doctor",
+    "calibrate",
+    "conformance",
+    "model",
+}
 
 
 @pytest.mark.parametrize("key", KEYS)

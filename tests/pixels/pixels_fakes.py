@@ -1,14 +1,10 @@
-"""Drawn objects by hand, and an eye that reads the drawn boxes."""
+"""Drawn objects and detections by hand."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from bikeped.detection.base import DetectorAnswer
 from bikeped.scene import DrawnObject
-from bikeped.service.vision import Picture
 from bikeped.types import Detections, Kind
 
 
@@ -32,19 +28,3 @@ def found(*rows: tuple[Kind, tuple[float, float, float, float]]) -> Detections:
         np.ones(len(rows), np.float32),
         np.asarray([box for _, box in rows], np.float32).reshape(-1, 4),
     )
-
-
-class OracleEye:
-    """Answers with `of(frame number)`."""
-
-    name = "oracle"
-    model_hash = None
-
-    def __init__(self, of: Callable[[int], Detections]) -> None:
-        self._of = of
-
-    def decode_size(self, width: int, height: int) -> tuple[int, int]:
-        return width, height
-
-    def see(self, picture: Picture) -> DetectorAnswer:
-        return DetectorAnswer(self._of(picture.frame.number), 0.0, 0.0, 0.0)

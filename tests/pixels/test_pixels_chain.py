@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pixels_fakes import OracleEye
+from drawn_eyes import OracleEye
 
 from bikeped.config import LoadedConfig, load_config
 from bikeped.conformance.scenario import Scenario, bundled_folder, load_scenarios

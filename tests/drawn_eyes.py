@@ -1,0 +1,45 @@
+"""Eyes that answer with what was drawn: for tests of what comes after a detector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bikeped.detection.base import DetectorAnswer
+from bikeped.scene import DrawnObject
+from bikeped.scene.clip import read_sidecar
+from bikeped.service.vision import Picture
+from bikeped.types import Detections
+
+
+class OracleEye:
+    """Answers with `of(frame number)`."""
+
+    name = "oracle"
+    model_hash: str | None = None
+
+    def __init__(self, of: Callable[[int], Detections]) -> None:
+        self._of = of
+
+    def decode_size(self, width: int, height: int) -> tuple[int, int]:
+        return min(width, 640), min(height, 640)
+
+    def see(self, picture: Picture) -> DetectorAnswer:
+        return DetectorAnswer(self._of(picture.frame.number), 0.0, 0.0, 0.0)
+
+
+def clip_eye(sidecar: Path) -> OracleEye:
+    """Sees in every frame of a drawn clip whoever shows."""
+    frames = read_sidecar(sidecar).frames
+    return OracleEye(lambda number: boxes([o for o in frames[number] if o.visible > 0.1]))
+
+
+def boxes(objects: Sequence[DrawnObject]) -> Detections:
+    """The exact boxes of what shows of `objects`."""
+    return Detections(
+        np.asarray([int(o.label) for o in objects], np.int8),
+        np.full(len(objects), 0.9, np.float32),
+        np.asarray([o.box_px for o in objects], np.float32).reshape(-1, 4),
+    )
