@@ -122,7 +122,7 @@ class Linear:
     @staticmethod
     def of(sightings: Sightings, fitted: Adjusted) -> Linear:
         jac, pulled = whitened(
-            jacobian(fitted.state, sightings.flat),
+            jacobian(fitted.state, sightings.flat, bent=fitted.model.board),
             fitted.residuals_px,
             fitted.sigma_px * SOFT_L1_TURN,
         )
@@ -183,7 +183,7 @@ def minimise(
     damping = _FIRST_DAMPING if turn_px is None else _NEAR_DAMPING
     steps, stopped, slope = 0, "the most steps were taken", np.inf
     while steps < _MOST_STEPS:
-        jac, pulled = whitened(jacobian(state, flat), error, turn_px)
+        jac, pulled = whitened(jacobian(state, flat, bent=model.board), error, turn_px)
         normal = normal_equations(jac, pulled, sightings.seen.astype(np.float64), basis)
         if prior is not None:
             normal = prior.added(normal, state)

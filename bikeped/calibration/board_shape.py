@@ -11,6 +11,7 @@ corners from either end. The flat board cannot tell; the bent one can: `alignmen
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +32,12 @@ def gauge_basis(flat: FloatArray) -> FloatArray:
 
     Rows are corner by corner x, y, z. In squares.
     """
+    return _basis(flat.tobytes())
+
+
+@functools.lru_cache(maxsize=8)  # every fit of a set asks for the same one
+def _basis(flat_bytes: bytes) -> FloatArray:
+    flat = np.frombuffer(flat_bytes).reshape(-1, 3)
     count = len(flat)
     x, y = flat[:, 0], flat[:, 1]
     free = np.zeros((7, count, 3))
@@ -44,7 +51,9 @@ def gauge_basis(flat: FloatArray) -> FloatArray:
     taken, _ = np.linalg.qr(free.reshape(7, -1).T)
     # The other columns of a complete orthonormal basis.
     full, _ = np.linalg.qr(np.concatenate([taken, np.eye(3 * count)], axis=1))
-    return np.asarray(full[:, 7 : 3 * count])
+    basis = np.ascontiguousarray(full[:, 7 : 3 * count])
+    basis.flags.writeable = False
+    return basis
 
 
 def prior_weights(count: int) -> FloatArray:

@@ -133,7 +133,7 @@ def covariance_of(adjusted: Adjusted, sightings: Sightings) -> FloatArray:
     state, flat = adjusted.state, sightings.flat
     basis = gauge_basis(flat) if adjusted.model.board else None
     normal = normal_equations(
-        jacobian(state, flat),
+        jacobian(state, flat, bent=adjusted.model.board),
         adjusted.residuals_px,
         sightings.seen.astype(np.float64),
         basis,
@@ -146,8 +146,7 @@ def covariance_of(adjusted: Adjusted, sightings: Sightings) -> FloatArray:
         normal.shared[m:, m:] += basis.T @ (spread[:, None] * basis)
         free -= basis.shape[1]
     variance = square / max(int(free), 1)
-    size = len(state.lens)
-    return np.asarray(normal.reduced_inverse()[:size, :size] * variance)
+    return np.asarray(normal.reduced_inverse(len(state.lens)) * variance)
 
 
 def rms_per_point(error: FloatArray, sightings: Sightings) -> float:

@@ -37,8 +37,11 @@ class Jacobian:
         return self.uv_px, self.lens, self.pose, self.shape
 
 
-def jacobian(state: State, flat: FloatArray) -> Jacobian:
-    """The derivatives at `state` for a board that is `flat` [C, 3] plus the state's shape."""
+def jacobian(state: State, flat: FloatArray, *, bent: bool = True) -> Jacobian:
+    """The derivatives at `state` for a board that is `flat` [C, 3] plus the state's shape.
+
+    `bent` False leaves the derivatives by the shape out: `shape` [V, C, 2, 0].
+    """
     turned = board_points(state, flat) @ state.turn.transpose(0, 2, 1)
     point = turned + state.move[:, None]
     # On the axis itself the direction across is free: a nudge of 1e-9 chooses one, and all limits
@@ -89,7 +92,7 @@ def jacobian(state: State, flat: FloatArray) -> Jacobian:
     pose[..., 1] = qz * ax - qx * az
     pose[..., 2] = qx * ay - qy * ax
     pose[..., 3:] = to_point
-    shape = to_point @ state.turn[:, None]
+    shape = to_point @ state.turn[:, None] if bent else to_point[..., :0]
     radius = focal * unit
     centre = state.lens[..., :2]
     uv = np.stack([centre[..., 0] + radius * ux, centre[..., 1] + radius * uy], axis=-1)

@@ -52,14 +52,21 @@ class Normal:
         change = -np.linalg.solve(reduced / np.outer(size, size), slope / size) / size
         return Step(change, -(solved[..., -1] + solved[..., :-1] @ change))
 
-    def reduced_inverse(self) -> FloatArray:
-        """[p, p] inverse of the shared block with the poses eliminated: the covariance for unit
-        noise."""
+    def reduced_inverse(self, size: int) -> FloatArray:
+        """[size, size] the first part of the shared block's inverse, the poses eliminated: the
+        covariance for unit noise; infinite variances where the pictures leave it open."""
         solved = np.linalg.solve(self.pose, self.strip)
-        reduced = self.shared - np.einsum("vkp,vkq->pq", self.strip, solved)
-        size = np.sqrt(np.maximum(np.diagonal(reduced), 1e-300))
-        scale = np.outer(size, size)
-        return np.asarray(np.linalg.pinv(reduced / scale, rcond=1e-14, hermitian=True) / scale)
+        flat_strip = self.strip.reshape(-1, len(self.shared))
+        reduced = self.shared - flat_strip.T @ solved.reshape(flat_strip.shape)
+        scale = np.sqrt(np.maximum(np.diagonal(reduced), 1e-300))
+        try:
+            part = np.linalg.solve(reduced / np.outer(scale, scale), np.eye(len(scale), size))
+        except np.linalg.LinAlgError:
+            return np.full((size, size), np.inf)
+        part = part[:size] / np.outer(scale[:size], scale[:size])
+        if not (np.diagonal(part) > 0).all():
+            return np.full((size, size), np.inf)
+        return np.asarray(part)
 
     @property
     def slope_size(self) -> float:

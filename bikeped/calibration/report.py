@@ -163,7 +163,8 @@ def _parameter_table(fit: Fit) -> str:
     for name, value in zip(fit.model.parameters, fit.state.lens, strict=True):
         sigma = fit.uncertainty[name]
         unit = " px" if name in ("cx", "cy", "f") else ""
-        digits = max(0, 2 - math.floor(math.log10(sigma))) if sigma > 0 else 6
+        usual = sigma > 0 and math.isfinite(sigma)
+        digits = max(0, 2 - math.floor(math.log10(sigma))) if usual else 6
         digits = min(digits, 10)
         rows.append(
             f"<tr><td>{name}</td><td>{value:.{digits}f}{unit}</td>"

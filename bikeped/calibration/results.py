@@ -8,7 +8,7 @@ from typing import Any
 
 from bikeped.calibration.compare import Calibrated, Recommendation
 from bikeped.calibration.fit import Fit, rms_by_picture
-from bikeped.calibration.write import ENDS_SLOW, ENDS_VAGUE, Field
+from bikeped.calibration.write import ENDS_SLOW, ENDS_VAGUE, Field, known
 
 #: Fewer boards than this leave a lens to chance; the paper used 42.
 _FEW_BOARDS = 10
@@ -58,7 +58,7 @@ def fit_data(fit: Fit) -> dict[str, Any]:
         "cy": fit.cy,
         "f": fit.focal_px,
         **{f"k{n + 1}": value for n, value in enumerate(k)},
-        "uncertainty": fit.uncertainty,
+        "uncertainty": known(fit.uncertainty),
         "measured_to_deg": math.degrees(fit.measured_to_rad),
         "rms_by_picture_px": {
             Path(name).name: float(error)

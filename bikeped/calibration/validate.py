@@ -56,7 +56,7 @@ def fit_poses(start: State, sightings: Sightings, steps: int = 20) -> State:
     damping: FloatArray = np.full(len(cost), 1e-8)
     index = np.arange(6)
     for _ in range(steps):
-        jac = jacobian(state, sightings.flat).pose * sightings.seen[..., None, None]
+        jac = jacobian(state, sightings.flat, bent=False).pose * sightings.seen[..., None, None]
         tall = jac.reshape(len(cost), -1, 6)
         normal = tall.transpose(0, 2, 1) @ tall
         slope = (tall.transpose(0, 2, 1) @ error.reshape(len(cost), -1, 1))[..., 0]
@@ -68,7 +68,7 @@ def fit_poses(start: State, sightings: Sightings, steps: int = 20) -> State:
         trial_error = residuals(trial, sightings)
         trial_cost = (trial_error * trial_error).sum((1, 2))
         better = trial_cost <= cost
-        gained = np.where(better, cost - trial_cost, 0.0)
+        rests = np.abs(cost - trial_cost) <= 1e-9 * cost + 1e-18
         state = replace(
             state,
             turn=np.where(better[:, None, None], trial.turn, state.turn),
@@ -77,6 +77,6 @@ def fit_poses(start: State, sightings: Sightings, steps: int = 20) -> State:
         error = np.where(better[:, None, None], trial_error, error)
         cost = np.asarray(np.where(better, trial_cost, cost))
         damping = np.asarray(np.where(better, damping / 10, damping * 10))
-        if (gained <= 1e-9 * cost + 1e-18).all() and better.all():
+        if rests.all():
             break
     return state

@@ -127,12 +127,17 @@ def calibration_data(
         "circle_radius_px": field.circle_px,
         "fov_ends_at": field.ends_at,
         "measured_to_deg": math.degrees(fit.measured_to_rad),
-        "uncertainty": fit.uncertainty,
+        "uncertainty": known(fit.uncertainty),
         "pattern": f"{sightings.pattern.columns}x{sightings.pattern.rows}",
         "date": (now or datetime.datetime.now(datetime.timezone.utc)).isoformat(timespec="seconds"),
         "software_version": __version__,
         "pictures_hash": prepared.pictures_hash,
     }
+
+
+def known(uncertainty: dict[str, float]) -> dict[str, float | None]:
+    """For JSON, which knows no infinity: null where the pictures leave a parameter open."""
+    return {name: sigma if math.isfinite(sigma) else None for name, sigma in uncertainty.items()}
 
 
 def write_calibration(path: Path, data: dict[str, Any]) -> Path | None:
