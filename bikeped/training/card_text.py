@@ -7,6 +7,9 @@ from typing import Any
 
 from bikeped.types import Kind
 
+AIM_RECALL, AIM_FALSE = 0.95, 1.0
+_WALKS_AND_RIDES = (Kind.PEDESTRIAN, Kind.CYCLIST)
+
 _HEAD = """# The small detector that comes with bikeped
 
 A network of {weights:,} weights ({megabytes:.2f} MB) that finds pedestrians, cyclists (bicycle and
@@ -49,6 +52,8 @@ saw, JPEG-encoded as a camera's. An object counts where at least 30 % of it show
 pixels wide at 960 across; it is found where a box of its kind overlaps it by half. The error is
 that of the box's bottom centre on the ground against the object's true middle: the near face of
 what has a depth is always nearer than its middle.
+
+{verdict}
 """
 
 _ROUND = "| {ring} | {objects} | {recall} | {median} | {p90} |"
@@ -77,6 +82,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         torch=training["torch"],
         beside=made.get("beside", ""),
         confidence=test["confidence"],
+        verdict=_verdict(test),
         most_false=", ".join(f"{n:g} {name}s" for name, n in made["most_false"].items()),
     )
     for title, key in (
@@ -87,6 +93,25 @@ def card_text(card: Mapping[str, Any]) -> str:
     if "experiment" in card:
         text += "\n" + _experiment(card["experiment"])
     return text
+
+
+def reached(test: Mapping[str, Any]) -> bool:
+    """Whether a test of the card has what was aimed at."""
+    recalls = [test["kinds"][k.label]["within_15_m"]["recall"] for k in _WALKS_AND_RIDES]
+    false = test["false_pedestrian_or_cyclist_per_100_frames"]
+    return bool(min(recalls) >= AIM_RECALL and false <= AIM_FALSE)
+
+
+def _verdict(test: Mapping[str, Any]) -> str:
+    aim = f"Aimed at, through the configured camera: recall of at least {AIM_RECALL:.0%} within "
+    aim += f"15 m for pedestrians and cyclists, at most {AIM_FALSE:g} false one a 100 frames."
+    if reached(test):
+        return f"{aim} **Reached.**"
+    recalls = " and ".join(
+        f"{test['kinds'][k.label]['within_15_m']['recall']:.1%}" for k in _WALKS_AND_RIDES
+    )
+    false = test["false_pedestrian_or_cyclist_per_100_frames"]
+    return f"{aim} **It falls short:** {recalls}, with {false:.1f} false ones."
 
 
 def _measured(title: str, test: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Our own small detector: a convolutional network of 660,000 weights.
+"""Our own small detector: a convolutional network of 474,000 weights.
 
 One stage, no anchors: three grids of strides 8, 16 and 32 pixels, each cell of which says how
 likely a road user of each class has its middle there and how far its four edges are from the cell's
