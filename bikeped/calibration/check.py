@@ -39,7 +39,7 @@ class Checked:
 
 def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> Checked | str:
     """The corners of a candidate [columns * rows, 2], row by row; or why it is none, in words."""
-    ids = np.arange(pattern.count, dtype=np.int64)
+    ids: IntArray = np.arange(pattern.count, dtype=np.int64)
     seen = places(pattern, ids)
     mended = repair(seen, uv_px, _ROUGH, int(_REPAIRABLE * pattern.count))
     if mended is None:
@@ -56,16 +56,15 @@ def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> C
             refined, good = again, better
     if good.mean() < _KEPT:
         return f"only {int(good.sum())} of {pattern.count} corners can be seen clearly"
-    wrong = _goes_on(grey, pattern, seen, refined.uv_px)
+    ids, seen, uv = ids[good], seen[good], refined.uv_px[good]
+    wrong = _goes_on(grey, pattern, seen, uv)
     if wrong:
         return wrong
-    spacing = local_map(seen, seen, refined.uv_px).spacing_px.min(1)
-    return Checked(
-        ids[good],
-        refined.uv_px[good],
-        float(np.median(refined.blur_px[good])),
-        float(np.median(spacing[good])),
-    )
+    if not good.all():  # a wrong corner has told its neighbours a wrong bend
+        refined = refine(grey, seen, uv)
+        uv = refined.uv_px
+    spacing = local_map(seen, seen, uv).spacing_px.min(1)
+    return Checked(ids, uv, float(np.median(refined.blur_px)), float(np.median(spacing)))
 
 
 def arranged(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> FloatArray:
@@ -132,14 +131,16 @@ def _good(grey: ImageArray, seen: FloatArray, refined: Refined) -> tuple[BoolArr
     """Which corners are crossings of the right colours where their neighbours expect them."""
     near = local_map(seen, seen, refined.uv_px)
     spacing = near.spacing_px.min(1)
-    off, expected = misfit(seen, refined.uv_px)
-    # At an edge the others can only be continued, and a board's corner lies off both ways.
-    share = np.array(_FINE)[_edges_touched(seen)]
-    fit = fits(refined, spacing) & (off * spacing < _FINE_PX + share * spacing)
     colour = crossing(grey, near) * np.where(seen.sum(1) % 2 == 0, 1.0, -1.0)
     if np.median(colour) < 0:
         colour = -colour
-    return np.asarray(fit & (colour > _CROSSES)), expected
+    clear = fits(refined, spacing) & (colour > _CROSSES)
+    if clear.mean() < 0.5:
+        return clear, refined.uv_px
+    off, expected = misfit(seen, refined.uv_px, clear)
+    # At an edge the others can only be continued, and a board's corner lies off both ways.
+    share = np.array(_FINE)[_edges_touched(seen)]
+    return np.asarray(clear & (off * spacing < _FINE_PX + share * spacing)), expected
 
 
 def _edges_touched(seen: FloatArray) -> IntArray:

@@ -74,10 +74,12 @@ def local_map(
     )
 
 
-def misfit(seen: FloatArray, uv_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """[n] how far each corner lies from where its neighbours expect it, in squares, and [n, 2]
-    where that is, in pixels."""
-    expected = local_map(seen, seen, uv_px, without_self=True)
+def misfit(
+    seen: FloatArray, uv_px: FloatArray, trusted: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """[n] how far each corner lies from where its trusted neighbours expect it, in squares, and
+    [n, 2] where that is, in pixels."""
+    expected = local_map(seen, seen[trusted], uv_px[trusted], without_self=True)
     off = np.linalg.norm(uv_px - expected.at_px, axis=1)
     return off / np.maximum(expected.spacing_px.min(axis=1), 1e-9), expected.at_px
 
@@ -94,12 +96,13 @@ def repair(
     trusted = np.ones(len(uv), np.bool_)
     for _ in range(most + 1):
         # A wrong corner spoils its neighbours' expectation too: the worst first, then look again.
-        off, _expected = misfit(seen[trusted], uv[trusted])
+        off, _ = misfit(seen, uv, trusted)
+        off[~trusted] = 0.0
         if off.max() <= limit:
             if moved.any():
                 uv[moved] = local_map(seen[moved], seen[trusted], uv[trusted]).at_px
             return uv, moved
-        worst = np.flatnonzero(trusted)[int(off.argmax())]
+        worst = int(off.argmax())
         trusted[worst], moved[worst] = False, True
     return None
 

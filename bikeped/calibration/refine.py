@@ -37,6 +37,7 @@ _PRIOR_ANGLE = 0.08
 _PRIOR_BLUR = 0.4  # of its logarithm
 _PRIOR_SLOPE = 0.05
 _PRIOR_BLEED = 0.1
+_STRANGE = np.float32(0.3)  # of half the window's contrast: what the model leaves, at most
 _ROOT = np.sqrt(2.0)
 
 
@@ -223,13 +224,14 @@ def _fit(window: _Window, blur_px: float, steps: int) -> _Fitted:
         basis[:, 6] = basis[:, 3] * basis[:, 3]
         factors = grey.astype(np.float32)
         left = window.level - (factors[:, None] @ basis)[:, 0]
-        left *= window.inside
         if step_number == steps:
             break
+        # A finger, a glare or the rim of the image circle in the window counts for little.
+        weight = window.inside / (1 + (left / _STRANGE) ** 2)
         # d level / d S = a3 + a4 u + a5 v + 2 a6 S
         slope = (factors[:, None, [3, 4, 5]] @ basis[:, :3])[:, 0]
         columns[:, :5] *= (slope + 2 * factors[:, 6, None] * basis[:, 3])[:, None]
-        weighted = columns * window.inside[:, None]
+        weighted = columns * weight[:, None]
         normal = (weighted @ columns.transpose(0, 2, 1)).astype(np.float64)
         normal[:, np.arange(12), np.arange(12)] += _PRIOR
         right = (weighted @ left[..., None])[..., 0].astype(np.float64)
@@ -244,7 +246,7 @@ def _fit(window: _Window, blur_px: float, steps: int) -> _Fitted:
             break
     swing = np.maximum(np.abs(grey[:, 3]), 1e-3)
     seen = np.maximum(window.inside.sum(1), 1)
-    residual = np.sqrt((left.astype(np.float64) ** 2).sum(1) / seen) / swing
+    residual = np.sqrt((window.inside * left * left).sum(1) / seen) / swing
     return _Fitted(_meeting(window, edge), np.exp(edge[:, 4]), 2 * swing * window.scale, residual)
 
 

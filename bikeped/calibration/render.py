@@ -63,12 +63,12 @@ def draw_picture(
         board, cover = _pixels(nodes, pattern, look, hidden)
         part = picture[top:low, u0:u1]
         part[...] = part * (1 - cover) + board
-    if look.shade > 0:
-        picture *= 1 - look.shade * (_radius(camera) / camera.lens.max_radius_px) ** 2
-    picture[_radius(camera) > camera.lens.max_radius_px] = 0
+    for row in range(camera.height):
+        out = _radius(camera, row) / camera.lens.max_radius_px
+        picture[row] *= (out <= 1) * (1 - look.shade * out * out)
     if look.blur_px > 0:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), look.blur_px), np.float32)
-    picture += rng.normal(0, look.noise, picture.shape).astype(np.float32)
+    picture += np.float32(look.noise) * rng.standard_normal(picture.shape, np.float32)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
@@ -184,6 +184,5 @@ def _surroundings(
     return np.asarray(np.clip(out, 0, 255), np.float32)
 
 
-def _radius(camera: DrawnCamera) -> FloatArray:
-    u, v = np.arange(camera.width) - camera.cx, np.arange(camera.height) - camera.cy
-    return np.asarray(np.hypot(u[None, :], v[:, None]))
+def _radius(camera: DrawnCamera, row: int) -> FloatArray:
+    return np.asarray(np.hypot(np.arange(camera.width) - camera.cx, row - camera.cy))
