@@ -88,6 +88,7 @@ def main() -> int:
         "conformance": conformance.run,
         "scene": scene.run,
         "calibration": calibration.run,
+        "calibration-large": calibration.large,
         "testbench": testbench.run,
     }
     parser = argparse.ArgumentParser(description=__doc__)
