@@ -139,9 +139,7 @@ def recommend(calibrated: Calibrated) -> Recommendation:
         equal,
         key=lambda f: (f.model.terms, order.index(f.model.projection), error(f)),
     )
-    text = (
-        f"{chosen.name} predicts pictures that it was not fitted to within {error(chosen):.3f} px"
-    )
+    text = f"{chosen.name} predicts pictures that did not help to fit it to {error(chosen):.3f} px"
     if chosen is best:
         simpler = [f for f in known if f.model.terms < chosen.model.terms]
         if simpler:
@@ -154,8 +152,8 @@ def recommend(calibrated: Calibrated) -> Recommendation:
             text += ", the least of all"
     else:
         text += (
-            f", within {EQUAL_SHARE:.0%} of the best ({best.name}, {error(best):.3f} px), and no "
-            "simpler lens does"
+            f", which is within {EQUAL_SHARE:.0%} of the best ({best.name}, {error(best):.3f} px), "
+            "and no simpler lens is"
         )
     return Recommendation(chosen.name, text + ".")
 
