@@ -1,6 +1,6 @@
 """Our own small detector from nothing: draws streets, trains, measures, writes the card.
 
-    scripts/train-detector --out DIR              all of it, under an hour on two cores
+    scripts/train-detector --out DIR              all of it, about an hour on two cores
     scripts/train-detector --out DIR --ship       and puts model and card into the package
     scripts/train-detector --out DIR --experiment rectilinear against fisheye-augmented training
 
