@@ -15,7 +15,7 @@ from bikeped.errors import BikepedError
 _FEWEST, _MOST = 3, 60
 
 
-class _Pattern(click.ParamType):
+class _Pattern(click.ParamType):  # type: ignore[type-arg]
     name = "pattern"
 
     def convert(

@@ -75,8 +75,8 @@ def coverage(camera: GroundCamera, pose: CameraPose) -> dict[str, Any]:
         -1,
     )
     _, seen = camera.project(ground.reshape(-1, 2))
-    seen = seen.reshape(len(bearing), len(reach))
-    some = seen.any(axis=1)
+    seen = np.asarray(seen).reshape(len(bearing), len(reach))
+    some = np.atleast_1d(seen.any(axis=1))
     near, far = seen.argmax(axis=1), len(reach) - 1 - seen[:, ::-1].argmax(axis=1)
     step = np.arange(len(bearing))
 

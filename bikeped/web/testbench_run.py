@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -194,7 +194,7 @@ class Workbench:
                     scenarios, camera, pose, TruthSettings(), perception, bench.delay, second
                 )
                 suite.__dict__["seen"] = tuple(
-                    self._seen.get((text, where), lambda s=scenario: see(s, camera, pose))
+                    self._seen.get((text, where), partial(see, scenario, camera, pose))
                     for text, scenario in zip(texts, scenarios, strict=True)
                 )
                 return suite
@@ -204,7 +204,7 @@ class Workbench:
             settings = bench.danger.settings()
             told = suite.with_truth(settings)
             told.__dict__["truths"] = tuple(
-                self._truths.get((text, settings), lambda s=scenario: judge_truth(s, settings))
+                self._truths.get((text, settings), partial(judge_truth, scenario, settings))
                 for text, scenario in zip(texts, scenarios, strict=True)
             )
             return told
