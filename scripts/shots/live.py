@@ -111,6 +111,7 @@ def take(studio: Studio) -> None:
                 page.wait_for_selector("#state[data-state=ALERT]")
                 page.wait_for_function("() => document.querySelector('#picture').naturalWidth > 0")
                 page.wait_for_selector("#health dd.ok-mark")
+                page.wait_for_timeout(9000)  # for curves of some length
                 studio.keep(page, f"live-{size}-{scheme}", whole=size == "phone")
                 showing.end()
                 if (size, scheme) == ("phone", "light"):
