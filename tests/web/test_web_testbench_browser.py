@@ -66,7 +66,7 @@ def test_the_page_says_why_the_light_is_red(testbench):
         assert page.locator(canvas).evaluate(drawn)
 
 
-def test_the_keyboard_scrubs_and_the_diagram_follows(testbench):
+def test_the_keyboard_scrubs_and_the_diagram_follows(testbench, until):
     page = testbench("scenario=Swerving%20Cyclist")
     track = page.locator("#track")
     track.focus()
@@ -85,7 +85,7 @@ def test_the_keyboard_scrubs_and_the_diagram_follows(testbench):
     expect(page.locator("#lamp")).to_have_attribute("data-state", "ALERT")
     track.press(" ")
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "true")
-    page.wait_for_function(f"document.querySelector('#track').ariaValueNow > {moment(page) + 3}")
+    until(page, f"document.querySelector('#track').ariaValueNow > {moment(page) + 3}")
     track.press(" ")
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
 
@@ -125,7 +125,7 @@ def test_a_slider_reruns_scenario_and_suite(testbench):
     expect(page.locator(".su-verdict")).to_contain_text("holds all gates")
 
 
-def test_of_many_quick_changes_the_last_one_holds(testbench):
+def test_of_many_quick_changes_the_last_one_holds(testbench, until):
     page = testbench()
     page.locator('input[data-key="decision.d_max_m"]').evaluate(
         """node => { for (let v = 5; v <= 20; v += 0.5) {
@@ -133,7 +133,7 @@ def test_of_many_quick_changes_the_last_one_holds(testbench):
     )
     settled(page)
     expect(page.locator("#suite pre")).to_contain_text("decision.d_max_m=20")
-    page.wait_for_function("location.hash.includes('decision.d_max_m=20')")
+    until(page, "location.hash.includes('decision.d_max_m=20')")
 
 
 def test_every_knob_gives_an_answer(testbench):
@@ -154,7 +154,7 @@ def test_every_knob_gives_an_answer(testbench):
     assert page.locator(".su-changes li").count() > 10
 
 
-def test_configurations_side_by_side(testbench):
+def test_configurations_side_by_side(testbench, until):
     page = testbench("scenario=U-Turn%20Cyclist")
     page.select_option("#beside-1", "ttc")
     page.select_option("#beside-2", "distance_only")
@@ -165,13 +165,13 @@ def test_configurations_side_by_side(testbench):
     page.select_option("#configuration", "narrow")
     settled(page)
     expect(rows.nth(0)).to_contain_text("Narrow")
-    page.wait_for_function("location.hash.includes('beside')")
+    until(page, "location.hash.includes('beside')")
     again = testbench(page.url.partition("#")[2])
     expect(again.locator("#figures tbody tr")).to_have_count(3)
     assert again.locator("#figures").inner_text() == page.locator("#figures").inner_text()
 
 
-def test_a_contest_goes_to_the_command_line_and_back(testbench, tmp_path, capsys):
+def test_a_contest_goes_to_the_command_line_and_back(testbench, until, tmp_path, capsys):
     page = testbench("scenario=Late%20Turn%20Toward%20Ped")
     slide(page, "decision.memory_frames", 20)
     slide(page, "danger.cpa_radius_m", 3)
@@ -190,7 +190,7 @@ def test_a_contest_goes_to_the_command_line_and_back(testbench, tmp_path, capsys
     caption = f"{len(data['changed'])} of {len(SCENARIOS)} scenarios change"
     expect(page.locator(".su-table caption")).to_contain_text(caption)
     # The link, and the file put back into a fresh page, show the same.
-    page.wait_for_function("location.hash.includes('delay')")
+    until(page, "location.hash.includes('delay')")
     linked = testbench(page.url.partition("#")[2])
     assert linked.locator("#suite").inner_text() == page.locator("#suite").inner_text()
     fresh = testbench()
