@@ -74,10 +74,14 @@ function draw(context, width, height, view, { play, frame, editing, handles }) {
     drawTrail(context, px, py, agent, frame, play.fps, tone);
   }
   const tracks = tracksAt(play, frame);
-  drawPairs(context, px, py, play, side, frame, tracks, tone);
+  const told = drawPairs(context, px, py, play, side, frame, tracks, tone);
   for (const agent of play.agents) drawAgent(context, px, py, agent, frame, view.scale, tone);
   for (const agent of play.agents) drawDetection(context, px, py, agent, frame, tone);
-  drawTracks(context, px, py, tracks, tone);
+  drawTracks(context, px, py, tracks, tone, told ? [[told.x - 26, told.y - 11, 52, 22]] : []);
+  if (told) {
+    context.textAlign = "center";
+    chip(context, told.text, told.x, told.y, told.fill, told.ink);
+  }
   drawScale(context, width, height, view.scale, tone);
   if (editing && handles) drawHandles(context, px, py, handles, tone);
 }
@@ -232,9 +236,8 @@ function drawDetection(context, px, py, agent, frame, tone) {
 }
 
 // Names of the tracks, where there is room: the whole name, its number only, or nothing.
-function drawTracks(context, px, py, tracks, tone) {
+function drawTracks(context, px, py, tracks, tone, taken) {
   context.textAlign = "left";
-  const taken = [];
   const free = (box) => taken.every(([x, y, w, h]) => box[0] > x + w || box[0] + box[2] < x || box[1] > y + h || box[1] + box[3] < y);
   for (const track of tracks) {
     const x = px(track.x), y = py(track.y);
@@ -253,7 +256,7 @@ function drawTracks(context, px, py, tracks, tone) {
   }
 }
 
-// Every pair by a thin line, the one that decides by a strong one with its distance.
+// Every pair by a thin line, the one that decides by a strong one; returns its distance's place.
 function drawPairs(context, px, py, play, side, frame, tracks, tone) {
   const places = new Map(tracks.map((track) => [track.id, track]));
   const chosen = chosenPair(play, side, frame);
@@ -273,7 +276,7 @@ function drawPairs(context, px, py, play, side, frame, tracks, tone) {
     line(pair);
   }
   context.setLineDash([]);
-  if (!chosen) return;
+  if (!chosen) return null;
   const state = stateAt(side, frame);
   context.strokeStyle = tone.panel;
   context.lineWidth = 7;
@@ -281,10 +284,8 @@ function drawPairs(context, px, py, play, side, frame, tracks, tone) {
   context.strokeStyle = colour(`--${state.toLowerCase()}`);
   context.lineWidth = state === "ALERT" ? 4 : 3;
   const middle = line(chosen);
-  if (middle) {
-    context.textAlign = "center";
-    chip(context, `${chosen.distance.toFixed(1)} m`, ...middle, colour(`--${state.toLowerCase()}`), colour(`--on-${state.toLowerCase()}`));
-  }
+  const name = state.toLowerCase();
+  return middle && { text: `${chosen.distance.toFixed(1)} m`, x: middle[0], y: middle[1], fill: colour(`--${name}`), ink: colour(`--on-${name}`) };
 }
 
 function drawScale(context, width, height, scale, tone) {
@@ -311,6 +312,7 @@ function drawScale(context, width, height, scale, tone) {
 
 function drawHandles(context, px, py, handles, tone) {
   context.textAlign = "left";
+  const told = [];
   for (const handle of handles) {
     const x = px(handle.x), y = py(handle.y);
     context.fillStyle = handle.chosen ? tone.ink : tone.panel;
@@ -320,6 +322,8 @@ function drawHandles(context, px, py, handles, tone) {
     context.rect(x - 6, y - 6, 12, 12);
     context.fill();
     context.stroke();
+    if (!handle.chosen && told.some(([a, b]) => Math.abs(a - x) < 44 && Math.abs(b - y) < 16)) continue;
+    told.push([x, y]);
     halo(context, `${handle.t.toFixed(1)} s`, x + 10, y + 11, tone.ink, tone.panel);
   }
 }
