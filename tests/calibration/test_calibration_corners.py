@@ -174,7 +174,7 @@ def test_a_corner_that_cannot_be_seen_is_left_out() -> None:
     truth, _ = true_corners(camera(), PATTERN, pose)
     hidden = int(np.argmin(np.abs(truth - truth.mean(0)).sum(1)))
     u, v = truth[hidden]
-    cv2.circle(picture, (round(float(u)), round(float(v))), 7, 130, -1)
+    cv2.circle(picture, (round(float(u)), round(float(v))), 9, 130, -1)
     from bikeped.calibration.check import Checked, check_board
 
     checked = check_board(picture, PATTERN, truth)
