@@ -49,7 +49,7 @@ from bikeped.training.small import SmallOrder, train_small
 from bikeped.training.warp import WarpRanges
 from bikeped.types import Kind
 
-PICTURES, STEPS = 4000, 6000
+PICTURES, STEPS = 5000, 6600
 TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
 VALIDATION = DrawnTest(pictures=400, seed=8_000_001)
 TEST = DrawnTest(pictures=600, seed=9_000_001)
@@ -60,7 +60,7 @@ MOST_FALSE = {Kind.PEDESTRIAN: 0.3, Kind.CYCLIST: 0.3, Kind.VEHICLE: 3.0}
 GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 
 #: Of the experiment: both networks get as much of everything.
-EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 800, 1000
+EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 800, 400
 
 
 def main() -> int:
@@ -166,7 +166,7 @@ def experiment(out: Path) -> None:
         model = folder / f"{name}.onnx"
         if not model.is_file():
             order_of_fit = FitSettings(
-                steps=EXPERIMENT_STEPS, warmup=100, memory=0.998, crops=CropSettings(view=view)
+                steps=EXPERIMENT_STEPS, warmup=60, crops=CropSettings(view=view)
             )
             fitted = fit(read_coco(folder / name), order_of_fit, say=say)
             export_network(fitted.network, fitted.names, (960, 544), model, {"experiment": name})

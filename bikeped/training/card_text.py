@@ -27,7 +27,7 @@ doctor` say so where it is configured.
 ## What it was trained on
 
 {pictures} pictures drawn by `bikeped.scene` ({objects} objects), and nothing else: no photograph,
-no other network's weights. Six tenths were seen by the configured camera from varied spots, the
+no other network's weights. Seven tenths were seen by the configured camera from varied spots, the
 others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 to 5.5 m high).
 
 | | |
@@ -36,7 +36,9 @@ others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 
 | sources | bikeped {bikeped}, commit {commit} |
 | seeds | pictures {seed_data}, training {seed}; validation and tests from seeds of their own |
 | drawing | {drawing_min:.0f} min |
-| training | {steps} steps of {windows} windows of 480 x 288 pixels, {training_min:.0f} min |
+| training | {steps} steps, {training_min:.0f} min |
+| first {packed:.0%} | {squares} squares of {side} pixels a step, full of windows around objects |
+| then | {windows} windows of 480 x 288 pixels a step |
 | machine | {machine}; PyTorch {torch} on the CPU, two threads{beside} |
 
 The input is 960 x 544 pixels, RGB / 255, the picture centred on grey 114; the output is laid out as
@@ -49,7 +51,7 @@ frames were false; a score is no probability.
 Measured through `bikeped.detection` at `detection.confidence` {confidence}, on pictures drawn at
 1920 x 1080 from seeds, places and lights that neither training nor the choice of the confidence
 saw, JPEG-encoded as a camera's. An object counts where at least 30 % of it shows and its box is 5
-pixels wide at 960 across; it is found where a box of its kind overlaps it by half. The error is
+pixels wide at 960 across (what benchmarks call reasonable is 65 %: told apart below); it is found where a box of its kind overlaps it by half. The error is
 that of the box's bottom centre on the ground against the object's true middle: the near face of
 what has a depth is always nearer than its middle.
 
@@ -78,6 +80,9 @@ def card_text(card: Mapping[str, Any]) -> str:
         training_min=training["seconds"] / 60,
         steps=settings["steps"],
         windows=settings["pictures"] * settings["windows"],
+        packed=settings["packed"],
+        squares=settings["pack"]["squares"],
+        side=settings["pack"]["side"],
         machine=made["machine"],
         torch=training["torch"],
         beside=made.get("beside", ""),
@@ -131,6 +136,7 @@ def _measured(title: str, test: Mapping[str, Any]) -> str:
             "| distance | objects | recall | median error | 90 % below |",
             "| --- | ---: | ---: | ---: | ---: |",
             _row("within 15 m", numbers["within_15_m"]),
+            *_mostly(numbers),
             *(_row(f"{r['from_m']:g} to {r['to_m']:g} m", r) for r in numbers["rings"]),
         ]
     lines += [
@@ -146,6 +152,12 @@ def _measured(title: str, test: Mapping[str, Any]) -> str:
             f"| {light} | {row['frames']} | {recalls} | {row['false_per_100_frames']:.1f} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def _mostly(numbers: Mapping[str, Any]) -> list[str]:
+    """The row of those of whom 65 % shows; older measurements lack it."""
+    mostly = numbers.get("within_15_m_mostly_visible")
+    return [_row("of them, 65 % or more visible", mostly)] if mostly else []
 
 
 def _percent(value: float | None) -> str:

@@ -21,6 +21,7 @@ from bikeped.types import FloatArray, ImageArray, IntArray
 
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
 _LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
+LARGEST_WINDOW_PX = 256  #: of those whose size is asked for one by one
 _NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest in grey levels
 
 
@@ -110,7 +111,7 @@ class Cutter:
     def __init__(self, settings: CropSettings, seed: int, usual_px: FloatArray) -> None:
         """`usual_px` [n, 2]: middles of objects in all of the pictures, in pixels of the view."""
         self._settings = settings
-        width, height = settings.window
+        width, height = (max(side, LARGEST_WINDOW_PX) for side in settings.window)
         random = np.random.default_rng([seed, 1])
         self._noise = [
             np.rint(random.normal(0, strength, (height, width, 3))).astype(np.int16)
@@ -118,11 +119,22 @@ class Cutter:
         ]
         self._usual = usual_px
 
-    def __call__(self, view: View, random: np.random.Generator) -> Crop:
-        """One window of `view`."""
-        width, height = self._settings.window
-        scale = float(random.uniform(*self._settings.scale))
-        left, top = self._corner(view, width / scale, height / scale, random)
+    def __call__(
+        self,
+        view: View,
+        random: np.random.Generator,
+        window: tuple[int, int] | None = None,
+        around: int | None = None,
+        scale: float | None = None,
+    ) -> Crop:
+        """One window of `view`; of another size than the settings' where `window` says so.
+
+        `around`: number of the object that it must hold as far as it fits, -1 for none (somewhere
+        where some other picture has one); None leaves it to the settings.
+        """
+        width, height = window or self._settings.window
+        scale = float(random.uniform(*self._settings.scale)) if scale is None else scale
+        left, top = self._corner(view, width / scale, height / scale, random, around)
         flip = random.random() < self._settings.flip
         move = np.array([[scale, 0.0, -left * scale], [0.0, scale, -top * scale]])
         if flip:
@@ -153,13 +165,20 @@ class Cutter:
         return crop
 
     def _corner(
-        self, view: View, wide: float, high: float, random: np.random.Generator
+        self, view: View, wide: float, high: float, random: np.random.Generator, around: int | None
     ) -> tuple[float, float]:
         """Upper left corner of a window of `wide` x `high` pixels of the view."""
         across, down = self._settings.view
         count = len(view.box_px)
         kind = random.random() - self._settings.around_object
-        if count and kind < 0:
+        if around is not None:
+            kind = 0.0  # where objects use to be, if not around this one
+        if around is not None and around >= 0:
+            box = view.box_px[around]
+            # Anywhere in the window, but whole; what is larger than the window fills it.
+            slack = (wide, high) - (box[2:] - box[:2])
+            left, top = box[:2] - random.uniform(0, 1, 2) * slack
+        elif count and kind < 0:
             # First the class, then the object: parked cars must not crowd out who walks.
             kinds = np.unique(view.class_id)
             mine = np.flatnonzero(view.class_id == kinds[int(random.integers(len(kinds)))])
@@ -192,7 +211,7 @@ class Cutter:
         if random.random() < 0.1:
             out = np.asarray(cv2.GaussianBlur(out, (0, 0), float(random.uniform(0.3, 0.6))))
         if random.random() < 0.3:
-            noise = self._noise[int(random.integers(_NOISES))]
+            noise = self._noise[int(random.integers(_NOISES))][: out.shape[0], : out.shape[1]]
             out = np.asarray(cv2.add(out, noise, dtype=cv2.CV_8U), np.uint8)
         return out
 

@@ -23,9 +23,18 @@ import torch
 from bikeped.errors import DataSetError, DetectorError
 from bikeped.files import write_whole
 from bikeped.training.coco import CocoData
-from bikeped.training.crops import Crop, CropSettings, Cutter, read_view, usual_places
+from bikeped.training.crops import (
+    Crop,
+    CropSettings,
+    Cutter,
+    View,
+    read_view,
+    usual_places,
+)
 from bikeped.training.loss import Truth, detection_loss
+from bikeped.training.muon import Muon
 from bikeped.training.network import STRIDES, SmallNet, grid
+from bikeped.training.packing import BLOCK_PX, Packer, PackSettings
 
 FORMAT = "bikeped small detector 1"
 _REPORT_EVERY = 100  #: steps
@@ -37,17 +46,22 @@ class FitSettings:
     """How long and how the network learns."""
 
     steps: int = 6000
-    pictures: int = 8  #: read for each step
-    windows: int = 3  #: cut from each of them
+    packed: float = 0.8  #: share of the steps, the first ones, that see windows laid side by side
+    pictures: int = 8  #: read for each of the other steps
+    windows: int = 1  #: cut from each of them
     rate: float = 2e-3  #: highest learning rate, of AdamW
+    matrix_rate: float = 0.02  #: highest learning rate of the convolutions, of Muon; 0: AdamW's
     decay: float = 0.02  #: of the weights
     warmup: int = 300  #: steps until the highest rate
-    memory: float = 0.9995  #: of the running mean of the weights
+    memory: float = 0.997  #: of the running mean of the weights
     seed: int = 0
     workers: int = 2  #: threads, each with its part of every step
-    bfloat16: bool = True  #: half as long on processors that know it; the loss is always float32
+    #: Half as long on processors that know it, six times as long on others; the loss is always
+    #: float32. None: where the processor knows it.
+    bfloat16: bool | None = None
     device: str = "cpu"
     crops: CropSettings = field(default_factory=CropSettings)
+    pack: PackSettings = field(default_factory=PackSettings)
 
 
 @dataclass(frozen=True)
@@ -77,21 +91,30 @@ def fit(
     device = torch.device(settings.device)
     network = SmallNet(len(data.categories)).to(device, memory_format=torch.channels_last).train()
     mean = copy.deepcopy(network).eval()
-    optimiser = _optimiser(network, settings)
+    optimisers = _optimisers(network, settings)
     workers = _workers(network, data, settings)
     losses: list[dict[str, float]] = []
     sums: dict[str, float] = {}
     with ThreadPoolExecutor(len(workers)) as pool:
+        ready = [pool.submit(worker.prepare, 0) for worker in workers]
         for step in range(settings.steps):
-            for group in optimiser.param_groups:
-                group["lr"] = learning_rate(step, settings)
-            answers = [pool.submit(worker, step) for worker in workers]
+            share = learning_rate(step, settings) / settings.rate
+            for optimiser in optimisers:
+                for group in optimiser.param_groups:
+                    group["lr"] = group["highest"] * share
+            for done in ready:
+                done.result()
+            answers = [pool.submit(worker.learn) for worker in workers]
             for answer in answers:
                 for name, part in answer.result().items():
                     sums[name] = sums.get(name, 0.0) + part / len(workers) / _REPORT_EVERY
+            # The next pictures are read while this step is taken.
+            if step + 1 < settings.steps:
+                ready = [pool.submit(worker.prepare, step + 1) for worker in workers]
             _join(network, workers)
             torch.nn.utils.clip_grad_norm_(network.parameters(), _STEEPEST_GRADIENT)
-            optimiser.step()
+            for optimiser in optimisers:
+                optimiser.step()
             _average(mean, network, min(settings.memory, (1 + step) / (10 + step)))
             progress(step + 1)
             if (step + 1) % _REPORT_EVERY == 0:
@@ -114,6 +137,15 @@ def learning_rate(step: int, settings: FitSettings) -> float:
         return settings.rate * (step + 1) / settings.warmup
     done = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
     return settings.rate * (0.02 + 0.98 * (1 + math.cos(math.pi * done)) / 2)
+
+
+def knows_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 itself (AVX-512 BF16, AMX, or Arm's BF16)."""
+    try:
+        flags = set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+    except OSError:
+        return False
+    return bool(flags & {"avx512_bf16", "amx_bf16", "bf16"})
 
 
 def save_weights(fitted: Fitted, path: Path, facts: dict[str, Any]) -> None:
@@ -185,30 +217,64 @@ class _Worker:
         self.network = network
         self._data, self._settings, self._part, self._cutter = data, settings, part, cutter
         self._device = next(network.parameters()).device
-        centre, stride = grid(*settings.crops.window)
-        self._centre, self._stride = centre.to(self._device), stride.to(self._device)
+        self._packer = Packer(settings.pack, settings.crops, cutter)
+        self._pool: list[View] = []
+        self._ready: tuple[torch.Tensor, list[Truth]] = (torch.zeros(0), [])
+        self._bfloat16 = knows_bfloat16() if settings.bfloat16 is None else settings.bfloat16
 
-    def __call__(self, step: int) -> dict[str, float]:
+    def prepare(self, step: int) -> None:
+        """Reads and cuts what `learn` will learn from."""
+        torch.set_num_threads(1)
+        packed = step < self._settings.packed * self._settings.steps
+        crops = self._squares(step) if packed else self._crops(step)
+        self._ready = _tensors(crops, self._device)
+        # What the squares normalised by stays as it is: plain windows are mostly asphalt, and
+        # people would look different to the network than while it learnt them.
+        _keep_statistics(self.network, not packed)
+
+    def learn(self) -> dict[str, float]:
         """Leaves the gradient in the copy; returns the parts of the loss."""
         torch.set_num_threads(1)
-        pictures, truths = _tensors(self._crops(step), self._device)
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._settings.bfloat16):
+        pictures, truths = self._ready
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bfloat16):
             score, edge = self.network(pictures)
-        loss, parts = detection_loss(score, edge, truths, self._centre, self._stride)
+        centre, stride = grid(pictures.shape[3], pictures.shape[2])
+        loss, parts = detection_loss(
+            score, edge, truths, centre.to(self._device), stride.to(self._device)
+        )
         self.network.zero_grad()
         loss.backward()
         return parts
 
+    def _squares(self, step: int) -> list[Crop]:
+        """Windows laid side by side, from a pool of pictures that is renewed bit by bit."""
+        pack, workers = self._settings.pack, self._settings.workers
+        read = pack.pictures if self._pool else max(pack.pool, pack.pictures)
+        # The first step fills the pool; every later one reads on from there.
+        first = 0 if not self._pool else max(pack.pool, pack.pictures) + (step - 1) * pack.pictures
+        self._pool += self._views(range(first, first + read))
+        self._pool = self._pool[-(pack.pool // workers) :]
+        random = np.random.default_rng([self._settings.seed, 4, step, self._part])
+        return self._packer(self._pool, pack.squares // workers, random)
+
     def _crops(self, step: int) -> list[Crop]:
+        """Windows as they are in the pictures."""
         settings = self._settings
         random = np.random.default_rng([settings.seed, 2, step, self._part])
         mine = range(step * settings.pictures, (step + 1) * settings.pictures)
-        crops = []
-        for number in mine[self._part :: settings.workers]:
-            image = self._data.images[self._picture(number)]
-            view = read_view(self._data, image, settings.crops.view)
-            crops += [self._cutter(view, random) for _ in range(settings.windows)]
-        return crops
+        self._pool = []
+        return [
+            self._cutter(view, random)
+            for view in self._views(mine)
+            for _ in range(settings.windows)
+        ]
+
+    def _views(self, numbers: range) -> list[View]:
+        """This part's share of the pictures `numbers`."""
+        return [
+            read_view(self._data, self._data.images[self._picture(n)], self._settings.crops.view)
+            for n in numbers[self._part :: self._settings.workers]
+        ]
 
     def _picture(self, number: int) -> int:
         """Every picture once a round, in another order each round."""
@@ -261,12 +327,34 @@ def _tensors(crops: list[Crop], device: torch.device) -> tuple[torch.Tensor, lis
     return pictures, truths
 
 
-def _optimiser(network: SmallNet, settings: FitSettings) -> torch.optim.Optimizer:
-    """AdamW; biases and normalisations are not pulled to zero."""
+def _keep_statistics(network: SmallNet, keep: bool) -> None:
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.train(not keep)
+
+
+def _optimisers(network: SmallNet, settings: FitSettings) -> list[torch.optim.Optimizer]:
+    """Muon for the convolutions within, AdamW for the last ones, which say the answer, and for
+    biases and normalisations, which are not pulled to zero."""
+    last = {
+        id(p) for head in network.heads for m in (head.score, head.edge) for p in m.parameters()
+    }
     weights = [p for p in network.parameters() if p.ndim > 1]
-    others = [p for p in network.parameters() if p.ndim <= 1]
-    groups = [{"params": weights, "weight_decay": settings.decay}, {"params": others}]
-    return torch.optim.AdamW(groups, lr=settings.rate, weight_decay=0.0)
+    within = [p for p in weights if id(p) not in last and settings.matrix_rate > 0]
+    taken = {id(p) for p in within}
+    groups: list[dict[str, Any]] = [
+        {"params": [p for p in weights if id(p) not in taken], "weight_decay": settings.decay},
+        {"params": [p for p in network.parameters() if p.ndim <= 1]},
+    ]
+    found: list[torch.optim.Optimizer] = [
+        torch.optim.AdamW(groups, lr=settings.rate, weight_decay=0.0)
+    ]
+    if within:
+        found.append(Muon(within, settings.matrix_rate, settings.decay))
+    for optimiser in found:
+        for group in optimiser.param_groups:
+            group["highest"] = group["lr"]
+    return found
 
 
 def _average(mean: SmallNet, network: SmallNet, share: float) -> None:
@@ -287,6 +375,8 @@ def _check(data: CocoData, settings: FitSettings) -> None:
         raise DataSetError(
             f"size {sides}: sides must be multiples of {STRIDES[-1]}; choose another --size"
         )
+    if settings.pack.side % BLOCK_PX or settings.pack.side % STRIDES[-1]:
+        raise DataSetError(f"squares of {settings.pack.side}: must be multiples of {BLOCK_PX}")
     if settings.pictures % settings.workers:
         raise DataSetError(
             f"batch {settings.pictures}: must be a multiple of {settings.workers}, so that each "

@@ -14,6 +14,7 @@ from bikeped.training.coco import CocoData
 from bikeped.training.crops import CropSettings
 from bikeped.training.export import export_network
 from bikeped.training.fit import FitSettings, fit, save_weights, settings_as_dict
+from bikeped.training.packing import PackSettings
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class SmallOrder:
     """What is asked for; the rest is `FitSettings`' own."""
 
     steps: int = 6000
-    pictures: int = 8  #: for each step
+    pictures: int = 8  #: read for each step
     seed: int = 0
     device: str = "auto"
     crops: CropSettings = field(default_factory=CropSettings)
@@ -44,6 +45,7 @@ def train_small(
     settings = FitSettings(
         steps=order.steps,
         pictures=order.pictures,
+        pack=PackSettings(pictures=order.pictures),
         warmup=min(300, max(1, order.steps // 10)),
         workers=2 if on_cpu and order.pictures % 2 == 0 else 1,
         seed=order.seed,

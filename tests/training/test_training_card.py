@@ -117,6 +117,15 @@ def test_the_summary_counts_at_a_confidence():
     assert summary(sights(), 0.1)["kinds"]["pedestrian"]["within_15_m"]["recall"] == 1
 
 
+def test_those_who_mostly_show_are_counted_apart(view):
+    half, whole = thing(BOX, visible=0.5), thing((500, 300, 520, 350))
+    seen = judge_picture(found((PED, 0.7, (500, 300, 520, 350))), [half, whole], view)
+    walkers = summary([seen], 0.25)["kinds"]["pedestrian"]
+    assert walkers["within_15_m"]["recall"] == 0.5
+    assert walkers["within_15_m_mostly_visible"]["objects"] == 1
+    assert walkers["within_15_m_mostly_visible"]["recall"] == 1
+
+
 def test_lights_are_told_apart():
     rows = by_light(sights(), ["day", "night"], 0.25)
     assert rows["day"] == {

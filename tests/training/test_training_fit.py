@@ -25,10 +25,12 @@ from bikeped.training.fit import (  # noqa: E402
     load_weights,
     save_weights,
 )
+from bikeped.training.packing import PackSettings  # noqa: E402
 
 CROPS = CropSettings(view=(160, 96), window=(96, 64), light=0, cover=0)
+PACK = PackSettings(side=128, squares=2, pictures=2, pool=4)
 SETTINGS = FitSettings(
-    steps=3, pictures=2, windows=1, warmup=2, memory=0.9, bfloat16=False, crops=CROPS
+    steps=3, pictures=2, warmup=2, memory=0.9, bfloat16=False, crops=CROPS, pack=PACK
 )
 
 
@@ -94,6 +96,28 @@ def test_one_worker_and_two_both_learn_from_the_whole_batch(data):
     assert all(torch.isfinite(p).all() for p in alone.network.parameters())
 
 
+def test_the_first_steps_see_squares_and_the_last_ones_windows(data, monkeypatch):
+    from bikeped.training import fit as module
+
+    seen = []
+
+    def tensors(crops, device):
+        seen.append({crop.rgb.shape[:2] for crop in crops})
+        return real(crops, device)
+
+    real = module._tensors
+    monkeypatch.setattr(module, "_tensors", tensors)
+    fit(data, replace(SETTINGS, workers=1, steps=4, packed=0.5))
+    assert seen == [{(128, 128)}] * 2 + [{(64, 96)}] * 2
+
+
+def test_without_a_rate_for_matrices_adam_moves_all_weights(data, fitted):
+    other = fit(data, replace(SETTINGS, matrix_rate=0.0))
+    first, second = (f.network.stem[0].conv.weight for f in (fitted, other))
+    assert torch.isfinite(second).all()
+    assert not torch.equal(first, second)
+
+
 def test_the_rate_rises_then_falls():
     settings = FitSettings(steps=100, warmup=10, rate=1.0)
     rates = [learning_rate(step, settings) for step in range(100)]
@@ -134,6 +158,8 @@ def test_files_that_are_no_weights_are_named(tmp_path, fitted):
 def test_unusable_data_are_named(data, tmp_path):
     with pytest.raises(DataSetError, match="multiples of 32"):
         fit(data, replace(SETTINGS, crops=replace(CROPS, window=(90, 64))))
+    with pytest.raises(DataSetError, match="multiples of 64"):
+        fit(data, replace(SETTINGS, pack=replace(PACK, side=100)))
     with pytest.raises(DataSetError, match="--batch"):
         fit(data, replace(SETTINGS, pictures=3))
     empty = blobs(tmp_path / "empty", 1, 0)
