@@ -49,7 +49,7 @@ from bikeped.training.small import SmallOrder, train_small
 from bikeped.training.warp import WarpRanges
 from bikeped.types import Kind
 
-PICTURES, STEPS = 5000, 6600
+PICTURES, STEPS = 5000, 6000
 TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
 VALIDATION = DrawnTest(pictures=400, seed=8_000_001)
 TEST = DrawnTest(pictures=600, seed=9_000_001)

@@ -52,7 +52,7 @@ class FitSettings:
     rate: float = 2e-3  #: highest learning rate, of AdamW
     matrix_rate: float = 0.02  #: highest learning rate of the convolutions, of Muon; 0: AdamW's
     decay: float = 0.02  #: of the weights
-    warmup: int = 300  #: steps until the highest rate
+    warmup: int = 100  #: steps until the highest rate
     memory: float = 0.997  #: of the running mean of the weights
     seed: int = 0
     workers: int = 2  #: threads, each with its part of every step

@@ -46,7 +46,7 @@ def train_small(
         steps=order.steps,
         pictures=order.pictures,
         pack=PackSettings(pictures=order.pictures),
-        warmup=min(300, max(1, order.steps // 10)),
+        warmup=min(100, max(1, order.steps // 10)),
         workers=2 if on_cpu and order.pictures % 2 == 0 else 1,
         seed=order.seed,
         device=device,
