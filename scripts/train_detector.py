@@ -60,7 +60,7 @@ MOST_FALSE = {Kind.PEDESTRIAN: 0.3, Kind.CYCLIST: 0.3, Kind.VEHICLE: 3.0}
 GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 
 #: Of the experiment: both networks get as much of everything.
-EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 800, 400
+EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 500, 300
 
 
 def main() -> int:
