@@ -13,10 +13,14 @@ from bikeped.errors import BikepedError
 def write_whole(path: Path, content: str | bytes) -> None:
     """Writes text (as UTF-8) or bytes under a temporary name and renames it.
 
+    A pipe or a device is written to as it is; a file of its name would take its place.
     BikepedError, naming the file and the mend, when it cannot.
     """
     data = content.encode("utf-8") if isinstance(content, str) else content
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            path.write_bytes(data)
+            return
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         try:
             with os.fdopen(handle, "wb") as file:
@@ -59,11 +63,11 @@ def write_like(path: Path, content: bytes, like: Path) -> None:
         ) from error
 
 
-def make_folder(folder: Path) -> None:
+def make_folder(folder: Path, option: str = "--out") -> None:
     """Makes an output folder and its parents; BikepedError when that cannot be."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BikepedError(
-            f"{folder}: cannot be made ({error.strerror}); choose another --out"
+            f"{folder}: cannot be made ({error.strerror}); choose another {option}"
         ) from error

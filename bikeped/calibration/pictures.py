@@ -24,6 +24,7 @@ from bikeped.types import Frame, ImageArray
 VIDEO_PIECE_S = 0.5
 #: Not more than this many pieces of one video: they get longer instead.
 VIDEO_PIECES = 150
+LEAST_SIDE_PX = 32  #: a board of the smallest squares that are found needs more
 _JUDGED_WIDTH = 640  # sharpness is compared on a picture of about this width
 
 
@@ -63,9 +64,14 @@ def load_pictures(paths: Iterable[Path | str]) -> list[Picture]:
 
 
 def check_sizes(pictures: Sequence[Picture]) -> None:
-    """CalibrationError where a picture's size is not the first one's."""
+    """CalibrationError where a picture holds no board or its size is not the first one's."""
     first = pictures[0]
     for picture in pictures:
+        if min(picture.width, picture.height) < LEAST_SIDE_PX:
+            raise CalibrationError(
+                f"{picture.name}: is {picture.width}x{picture.height} pixels, too small for a "
+                "board; take the camera's own pictures, not thumbnails"
+            )
         if (picture.width, picture.height) != (first.width, first.height):
             raise CalibrationError(
                 f"{picture.name}: is {picture.width}x{picture.height} pixels, but {first.name} is "

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from bikeped.cli.common import config_options, console, json_option, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    console,
+    json_option,
+    write_json,
+)
 from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, framing, ground_camera, load_config
 from bikeped.errors import BikepedError, CaptureError
@@ -31,7 +37,7 @@ _PICTURES = {".png", ".jpg", ".jpeg"}
 @click.option(
     "--at",
     "at_s",
-    type=click.FloatRange(0, 1e6),
+    type=FiniteRange(0, 1e6),
     default=0.0,
     metavar="SECONDS",
     help="Of a video: the frame at this time; default: the first.",
@@ -177,6 +183,7 @@ def _save(loaded: LoadedConfig, found: Fit) -> Saved:
 
 
 def _print(found: Fit, saved: Saved | None) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     from bikeped.geometry.alignment import PARAMETERS
@@ -195,7 +202,7 @@ def _print(found: Fit, saved: Saved | None) -> None:
     for r in found.residuals:
         note = "look again" if r.strange else ""
         marks.add_row(
-            r.mark,
+            escape(r.mark),
             r.what,
             f"{r.measured_m:.2f}",
             f"{r.read_m:.2f}",
@@ -208,7 +215,7 @@ def _print(found: Fit, saved: Saved | None) -> None:
     if not found.spare:
         screen.print("no measurement is left over: nothing checks these numbers; add a mark")
     if found.suspect is not None:
-        screen.print(f"the others agree without mark {found.suspect}: measure it again")
+        screen.print(f"the others agree without mark {escape(found.suspect)}: measure it again")
     elif found.strange:
         screen.print("the marks do not agree with one another: measure them again")
     if saved is not None:

@@ -8,8 +8,13 @@ from pathlib import Path
 import click
 
 from bikeped.cli.calibrate_options import PATTERN, Asked
-from bikeped.cli.common import config_options, console, json_option
-from bikeped.cli.guard import guarded
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    console,
+    json_option,
+)
+from bikeped.cli.guard import check_outputs, guarded
 from bikeped.errors import BikepedError
 
 _MODELS = ("equidistant", "equisolid", "stereographic", "orthographic", "linear", "equalarea")
@@ -27,7 +32,7 @@ _DEFAULT_OUT = Path("camera_calibration.json")
 @click.option(
     "--square",
     "square_m",
-    type=click.FloatRange(0, 10, min_open=True),
+    type=FiniteRange(0, 10, min_open=True),
     metavar="METRES",
     help="Side of a square, as measured on the print. The lens does not depend on it.",
 )
@@ -126,6 +131,17 @@ def command(
         from bikeped.conformance.figure_style import require_matplotlib
 
         require_matplotlib()
+    target = out or _DEFAULT_OUT
+    if board_path is None:
+        lens = [(f"{target}, the lens,", target)]
+        if out is not None and target.exists():
+            lens.append((f"{target}.bak, the former lens,", target.with_name(target.name + ".bak")))
+        others = (("--report", report_path), ("--json", json_path))
+        check_outputs(
+            [("IMAGES", path) for path in images]
+            + ([("-c", config_path)] if config_path is not None else []),
+            lens + [(name, Path(p)) for name, p in others if p is not None and p != "-"],
+        )
     screen = console(json_path)
     asked = Asked.of(pattern, square_m, model, terms, board_shape, compare, folds or 0)
     if board_path is not None:

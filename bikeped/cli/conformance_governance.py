@@ -213,7 +213,7 @@ def contest(
 @scenarios_option
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE.md",
     help="Write the register as Markdown.",
 )
@@ -245,7 +245,7 @@ def register(
 @click.option("--scenario", "name", metavar="NAME", help="Only this scenario.")
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=click.Path(path_type=Path, file_okay=False),
     required=True,
     metavar="DIR",
     help="Folder for the pictures; it is made.",

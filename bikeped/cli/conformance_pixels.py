@@ -76,12 +76,15 @@ def command(
         from bikeped.conformance.figure_style import require_matplotlib
 
         require_matplotlib()
+        make_folder(figures, "--figures")
     # One thread each: the processes share the cores. A --set that is given comes later and wins.
     overrides = ("detection.threads=1", *overrides)
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     if loaded.config.detection.model is None:
         loaded, suite = begin(config_path, ("detection.model=bundled", *overrides), scenarios_dir)
     if names:
+        if len(set(names)) < len(names):
+            raise BikepedError("--scenario: names a scenario twice, which would count it twice")
         suite = replace(
             suite, scenarios=tuple(s for n in names for s in one_scenario(suite, n).scenarios)
         )
@@ -96,7 +99,6 @@ def command(
     if figures is not None:
         from bikeped.pixels.figure import draw_pixels
 
-        make_folder(figures)
         draw_pixels(result.data, figures)
     emit(result, suite, loaded, seed or 0, json_path)
     if json_path != "-":

@@ -12,7 +12,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from bikeped.cli.common import config_options, console, json_option, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    console,
+    json_option,
+    write_json,
+)
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 
@@ -75,7 +81,7 @@ curve_option = click.option(
 )
 burst_option = click.option(
     "--burst",
-    type=click.FloatRange(1, 1000),
+    type=FiniteRange(1, 1000),
     default=5.0,
     show_default=True,
     help="Mean length of a burst of misses, in frames.",

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import click
 
 from bikeped.cli.common import (
+    FiniteRange,
     config_options,
     json_option,
     progress_bar,
     write_json,
 )
-from bikeped.cli.guard import guarded
+from bikeped.cli.guard import check_outputs, guarded
 from bikeped.cli.web_options import open_pages, web_option, web_overrides
 from bikeped.config import load_config
-from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
 
 SIZE = (1920, 1080)
@@ -35,7 +34,7 @@ FPS = 30
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(min=0.1),
+    type=FiniteRange(min=0.1),
     help="Only the beginning: so many seconds of the crossing.",
 )
 @web_option
@@ -56,21 +55,25 @@ def command(
     from bikeped.conformance.scenario import load_scenario
     from bikeped.demo import bundled_scenario, format_summary, summarise
     from bikeped.models import BUNDLED, NOT_FOR_STREETS
-    from bikeped.scene import Conditions, ScenePainter, scene_camera
+    from bikeped.scene import Conditions, ScenePainter, scene_camera, sidecar_path
     from bikeped.scene.clip import frame_times, write_clip
     from bikeped.service.replay import ReplayFiles, replay
 
-    if seconds is not None and not math.isfinite(seconds):
-        raise BikepedError(f"--seconds {seconds}: is not a number of seconds; give e.g. 5")
     if web_place is not None:
         overrides += web_overrides(web_place)
     loaded = load_config(config_path, overrides)
     if loaded.config.detection.model is None:
         loaded = load_config(config_path, (f"detection.model={BUNDLED}", *overrides))
     pages = None if web_place is None else open_pages(loaded)
-    make_folder(out)
-    scenario = load_scenario(bundled_scenario())
     clip, events, overlay = out / "crossing.avi", out / "events.jsonl", out / "overlay.mp4"
+    names = [clip, sidecar_path(clip), events, overlay, out / "summary.txt", out / "summary.json"]
+    make_folder(out)
+    check_outputs(
+        [("-c", config_path)] if config_path is not None else [],
+        [("--out", name) for name in names]
+        + ([("--json", Path(json_path))] if json_path not in (None, "-") else []),
+    )
+    scenario = load_scenario(bundled_scenario())
     painter = ScenePainter(scenario, scene_camera(loaded, SIZE), Conditions())
     frames = len(frame_times(painter, FPS, seconds))
     with progress_bar("drawing", frames) as tell:

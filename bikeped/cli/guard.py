@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+
+import click
 
 from bikeped.errors import BikepedError
 
@@ -27,6 +29,7 @@ _INPUTS = {
     "models": "MODEL",
     "weights": "WEIGHTS",
     "validation": "--validation",
+    "challenge": "FILE_OR_LINK",
     "picture": "FRAME",
     "points_path": "--points",
 }
@@ -55,8 +58,13 @@ def guarded(command: F) -> F:
     @functools.wraps(command)
     def checked(**given: Any) -> Any:
         check_outputs(
-            [(_INPUTS[k], p) for k in _INPUTS if k in given for p in _paths(given[k])],
-            [(_OUTPUTS[k], p) for k in _OUTPUTS if k in given for p in _paths(given[k])],
+            [(_INPUTS[k], p) for k in _INPUTS if k in given for p in _read_paths(given[k])],
+            [
+                (_shown(k), path)
+                for k in _OUTPUTS
+                if k in given and not _is_folder(k, given)
+                for path in _written_paths(given[k])
+            ],
         )
         return command(**given)
 
@@ -65,12 +73,10 @@ def guarded(command: F) -> F:
 
 def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[str, Path]]) -> None:
     """See `guarded`; each is how the command line names it, and the path."""
-    read = [(name, path, path.resolve()) for name, path in inputs if path.exists()]
+    read = [(name, path, path.resolve()) for name, path in inputs if _exists(str(path))]
     written: dict[Path, str] = {}
     for name, path in outputs:
         target = path.resolve()
-        if name == "--out" and (path.is_dir() or not path.suffix):
-            continue  # a folder: what goes into it has names of its own
         for what, source, real in read:
             if target == real or (path.exists() and path.samefile(source)):
                 raise BikepedError(
@@ -94,12 +100,46 @@ def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[st
             )
 
 
-def _paths(value: Any) -> list[Path]:
-    """The paths of a parameter: none, one, or several; `-` is standard output."""
+def _parameter(name: str) -> click.Parameter | None:
+    context = click.get_current_context(silent=True)
+    found = context.command.params if context is not None else []
+    return next((p for p in found if p.name == name), None)
+
+
+def _shown(name: str) -> str:
+    """How the command line names an output: its option, or the argument's own word."""
+    parameter = _parameter(name)
+    if isinstance(parameter, click.Argument):
+        return str(parameter.metavar or name.upper())
+    return _OUTPUTS[name]
+
+
+def _is_folder(name: str, given: Mapping[str, Any]) -> bool:
+    """Whether an output is a folder: what goes into it has names of its own."""
+    parameter = _parameter(name)
+    kind = parameter.type if parameter is not None else None
+    if isinstance(kind, click.Path) and not kind.file_okay:
+        return True
+    return name == "out" and given.get("dataset") is not None  # `scene --dataset N --out FOLDER`
+
+
+def _written_paths(value: Any) -> list[Path]:
+    """The paths of an output: none or one; `-` is standard output."""
+    return [] if value is None or value == "-" else [Path(str(value))]
+
+
+def _read_paths(value: Any) -> list[Path]:
+    """The paths of an input: none, one, or several; `NAME=FILE` where a file has a name."""
     if value is None or value == "-":
         return []
     if isinstance(value, (tuple, list)):
-        return [path for item in value for path in _paths(item)]
-    # --configuration NAME=FILE
+        return [path for item in value for path in _read_paths(item)]
     text = str(value)
-    return [Path(text.partition("=")[2] if "=" in text and not Path(text).exists() else text)]
+    return [Path(text.partition("=")[2] if "=" in text and not _exists(text) else text)]
+
+
+def _exists(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    except (OSError, ValueError):  # a link can be longer than any name
+        return False

@@ -5,9 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from rich.markup import escape
 from rich.table import Table
 
-from bikeped.cli.common import console, json_option, progress_bar, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    console,
+    json_option,
+    progress_bar,
+    write_json,
+)
 from bikeped.cli.guard import check_outputs, guarded
 
 
@@ -101,7 +108,7 @@ from bikeped.cli.guard import check_outputs, guarded
 )
 @click.option(
     "--least-share",
-    type=click.FloatRange(0, 1),
+    type=FiniteRange(0, 1),
     default=0.3,
     show_default=True,
     help="Objects of which less than this share of the area is left are dropped.",
@@ -166,8 +173,8 @@ def command(
         table.add_column("objects", justify="right")
         for name, count in summary.by_category.items():
             if count:
-                table.add_row(name, str(count))
+                table.add_row(escape(name), str(count))
         if summary.objects:
             screen.print(table)
-        screen.print(f"wrote {out / 'annotations.json'} and {out / 'images'}")
+        screen.print(escape(f"wrote {out / 'annotations.json'} and {out / 'images'}"))
     return 0

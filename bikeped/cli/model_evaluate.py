@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    console,
+    json_option,
+    progress_bar,
+    write_json,
+)
 from bikeped.cli.conformance_shared import print_table
 from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config import load_config
@@ -31,14 +38,14 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--confidence",
-    type=click.FloatRange(0.0001, 1),
+    type=FiniteRange(0.0001, 1),
     default=0.001,
     show_default=True,
     help="Least confidence for classes and merged kinds; what is deployed has its own.",
 )
 @click.option(
     "--iou",
-    type=click.FloatRange(0.01, 1),
+    type=FiniteRange(0.01, 1),
     default=0.65,
     show_default=True,
     help="Overlap at which the weaker box goes, for classes and merged kinds.",

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
 
 from bikeped.cli.common import console, json_option, write_json
 from bikeped.cli.guard import guarded
@@ -90,12 +91,16 @@ def _print(summary: dict[str, Any]) -> None:
     screen = console()
     if "model" in summary:
         screen.print(
-            f"wrote {summary['model']}: {summary['bytes'] / 1e6:.2f} MB, input "
-            f"{summary['size'][0]} x {summary['size'][1]}, {', '.join(summary['names'])}; boxes "
-            f"within {summary['largest_box_difference_px']:.2g} px of PyTorch's"
+            escape(
+                f"wrote {summary['model']}: {summary['bytes'] / 1e6:.2f} MB, input "
+                f"{summary['size'][0]} x {summary['size'][1]}, {', '.join(summary['names'])}; "
+                f"boxes within {summary['largest_box_difference_px']:.2g} px of PyTorch's"
+            )
         )
     if "engine" in summary:
         screen.print(
-            f"wrote {summary['engine']}: {summary['engine_bytes'] / 1e6:.2f} MB, TensorRT "
-            f"{summary['tensorrt']}, {'16' if summary['half_precision'] else '32'}-bit"
+            escape(
+                f"wrote {summary['engine']}: {summary['engine_bytes'] / 1e6:.2f} MB, TensorRT "
+                f"{summary['tensorrt']}, {'16' if summary['half_precision'] else '32'}-bit"
+            )
         )

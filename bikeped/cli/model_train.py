@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
 
 from bikeped.cli.common import console, json_option, progress_bar, write_json
 from bikeped.cli.guard import check_outputs, guarded
@@ -134,8 +135,12 @@ def _refuse(value: object, option: str) -> None:
 def _print(summary: dict[str, Any], out: Path) -> None:
     screen = console()
     screen.print(
-        f"{summary['network']}: {summary['pictures']} pictures with {summary['objects']} objects "
-        f"of {', '.join(summary['names'])}; {summary['seconds'] / 60:.1f} min on "
-        f"{summary['device']}"
+        escape(
+            f"{summary['network']}: {summary['pictures']} pictures with {summary['objects']} "
+            f"objects of {', '.join(summary['names'])}; {summary['seconds'] / 60:.1f} min on "
+            f"{summary['device']}"
+        )
     )
-    screen.print(f"wrote {summary['weights']}, {summary['model']} and {out / 'training.json'}")
+    screen.print(
+        escape(f"wrote {summary['weights']}, {summary['model']} and {out / 'training.json'}")
+    )

@@ -8,8 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
 
-from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    console,
+    json_option,
+    progress_bar,
+    write_json,
+)
 from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError, GeometryError, ScenarioError
@@ -50,7 +58,7 @@ _COLOURS = ((255, 70, 60), (70, 230, 90), (70, 160, 255))
     help="Clothes, sun, noise; with --dataset everything.",
 )
 @click.option("--fps", type=click.IntRange(1, 240), default=30, show_default=True)
-@click.option("--seconds", type=click.FloatRange(min=0.001), help="Only the beginning.")
+@click.option("--seconds", type=FiniteRange(min=0.001), help="Only the beginning.")
 @click.option("--quality", type=click.IntRange(1, 100), default=88, show_default=True)
 @click.option(
     "--still",
@@ -94,7 +102,7 @@ def command(
     json_path: str | None,
 ) -> None:
     """Draw SCENARIO (a file, or the name of a bundled one) as the configured camera sees it."""
-    from bikeped.scene import Conditions, ScenePainter
+    from bikeped.scene import Conditions, ScenePainter, sidecar_path
 
     loaded = load_config(config_path, overrides)
     wide_high = _size(size)
@@ -116,12 +124,12 @@ def command(
     source = Path(found.source)
     conditions = Conditions(seed=seed, light=light, weather=weather, place=place)
     view = _camera(loaded, wide_high)
+    read = [("SCENARIO", source)] + ([("-c", config_path)] if config_path else [])
+    told = [("--json", Path(str(json_path)))] if json_path not in (None, "-") else []
     if still is not None:
-        written = [("--still", still[1])]
-        if json_path not in (None, "-"):
-            written.append(("--json", Path(str(json_path))))
-        read = [("SCENARIO", source)] + ([("-c", config_path)] if config_path else [])
-        check_outputs(read, written)
+        if seconds is not None:
+            raise BikepedError("--seconds: is for a clip; leave it out with --still")
+        check_outputs(read, [("--still", still[1]), *told])
         summary = _still(ScenePainter(found, view, conditions), *still, boxes=boxes)
         _tell(summary, json_path, f"wrote {still[1]}: {len(summary['objects'])} objects")
         return
@@ -129,9 +137,8 @@ def command(
         return
     if boxes:
         raise BikepedError("--boxes: goes with --still; a clip's boxes lie beside it")
-    if seconds is not None and not math.isfinite(seconds):
-        raise BikepedError(f"--seconds {seconds}: is not a number of seconds; give e.g. 5")
-    summary = _clip(ScenePainter(found, view, conditions), out, source, fps, quality, seconds)
+    check_outputs(read, [("--out", out), ("the boxes beside --out", sidecar_path(out)), *told])
+    summary = _clip(ScenePainter(found, view, conditions), out, fps, quality, seconds)
     _tell(
         summary,
         json_path,
@@ -141,12 +148,11 @@ def command(
 
 
 def _clip(
-    painter: ScenePainter, out: Path, source: Path, fps: int, quality: int, seconds: float | None
+    painter: ScenePainter, out: Path, fps: int, quality: int, seconds: float | None
 ) -> dict[str, Any]:
-    from bikeped.scene import read_sidecar, sidecar_path, write_clip
+    from bikeped.scene import read_sidecar, write_clip
     from bikeped.scene.clip import frame_times
 
-    check_outputs([("SCENARIO", source)], [("--out", out), ("--out", sidecar_path(out))])
     times = frame_times(painter, fps, seconds)
     with progress_bar("drawing", len(times)) as tell:
         beside = write_clip(
@@ -295,7 +301,7 @@ def _tell(summary: dict[str, Any], json_path: str | None, line: str) -> None:
     if json_path == "-":
         return
     screen = console(json_path)
-    screen.print(line)
+    screen.print(escape(line))
     if "seen" in summary:
         shown = ", ".join(f"{count} {kind}" for kind, count in summary["seen"].items()) or "nobody"
         screen.print(f"in it: {shown}")

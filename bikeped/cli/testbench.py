@@ -13,7 +13,7 @@ from rich.markup import escape
 from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
 from bikeped.cli.conformance_shared import scenarios_option
 from bikeped.cli.governance_tables import print_contest
-from bikeped.cli.guard import check_outputs, guarded
+from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, load_config
 from bikeped.conformance.scenario import Scenario, bundled_folder, load_scenarios
 from bikeped.errors import BikepedError
@@ -90,19 +90,19 @@ def contest(
 
     FILE_OR_LINK is the file, or the page's address with all that follows its #.
     """
+    from bikeped.web.testbench_contest import Origin
     from bikeped.web.testbench_contest import challenge as run
     from bikeped.web.testbench_run import Workbench, trial_summaries
     from bikeped.web.testbench_settings import in_force, parse_link
 
     file = _as_file(challenge)
-    if file is not None and json_path not in (None, "-"):
-        check_outputs([("FILE", file)], [("--json", Path(str(json_path)))])
     loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
     bench = parse_link(challenge, in_force(loaded)) if file is None else _read(file)
     work = Workbench(loaded, scenarios)
     found = run(work, bench).as_dict()
     trials = trial_summaries(work.whole(bench), bench)
-    words = shlex.join(["bikeped", "testbench", "contest", challenge])
+    origin = Origin(config_path, scenarios_dir, overrides)
+    words = shlex.join(["bikeped", "testbench", "contest", challenge, *origin.options()])
     if json_path is not None:
         write_json({"command": words, **found, "trials": trials}, json_path)
     print_contest(found, words, json_path)

@@ -51,9 +51,10 @@ frames were false; a score is no probability.
 Measured through `bikeped.detection` at `detection.confidence` {confidence}, on pictures drawn at
 1920 x 1080 from seeds, places and lights that neither training nor the choice of the confidence
 saw, JPEG-encoded as a camera's. An object counts where at least 30 % of it shows and its box is 5
-pixels wide at 960 across (what benchmarks call reasonable is 65 %: told apart below); it is found where a box of its kind overlaps it by half. The error is
-that of the box's bottom centre on the ground against the object's true middle: the near face of
-what has a depth is always nearer than its middle.
+pixels wide at 960 across (what benchmarks call reasonable is 65 %: told apart below); it is found
+where a box of its kind overlaps it by half. The error is that of the box's bottom centre on the
+ground against the object's true middle: the near face of what has a depth is always nearer than its
+middle.
 
 {verdict}
 """

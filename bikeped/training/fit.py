@@ -194,7 +194,10 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise DetectorError(f"{path}: cannot be read ({error.strerror})") from error
     except Exception as error:  # a damaged file raises anything
-        raise DetectorError(f"{path}: is no file of weights ({_line(error)})") from error
+        # Its text may advise to load the file without the protection against what it runs.
+        raise DetectorError(
+            f"{path}: is no file of weights; name the weights.pt that `bikeped model train` wrote"
+        ) from error
     return body if isinstance(body, dict) else {}
 
 

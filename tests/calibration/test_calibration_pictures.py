@@ -77,6 +77,12 @@ def test_sizes_must_agree(tmp_path: Path) -> None:
         load_pictures([first, other])
 
 
+def test_a_thumbnail_holds_no_board(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "tiny.png"), np.zeros((1, 1), np.uint8))
+    with pytest.raises(CalibrationError, match=r"tiny\.png: is 1x1 pixels, too small"):
+        load_pictures([tmp_path / "tiny.png"])
+
+
 def test_a_video_gives_the_sharpest_frame_of_every_half_second(tmp_path: Path) -> None:
     path = tmp_path / "clip.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))

@@ -73,6 +73,17 @@ def test_a_points_file_gives_the_fit(site, capsys: pytest.CaptureFixture[str]) -
     assert "a mark at 10 m reads 10 m +/-" in out
 
 
+def test_names_of_marks_are_text_whatever_they_look_like(site, capsys) -> None:
+    clip, config, points, written = site
+    names = ("[/nope]", "[red]", "[bold]kerb", "4")
+    for mark, name in zip(written["marks"], names, strict=False):
+        mark["name"] = name
+    points.write_text(json.dumps(written))
+    assert run(clip, "-c", config, "--points", points) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in names[: len(written["marks"])])
+
+
 def test_save_writes_the_fit_and_keeps_the_file_before(site, capsys) -> None:
     clip, config, points, _ = site
     before = config.read_text()

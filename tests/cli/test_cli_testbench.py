@@ -104,6 +104,9 @@ def test_a_challenge_gives_the_page_s_numbers_on_the_command_line(name, folder, 
         data = json.loads(capsys.readouterr().out)
         assert figures(data) == figures(said)
         assert data["trials"] == said["trials"]
+        repeat = shlex.split(data["command"])
+        assert main([*repeat[1:], "--json", "-"]) == 0
+        assert figures(json.loads(capsys.readouterr().out)) == figures(said)
     assert (said["command"] is not None) == plain
     if plain:  # the older command says the same challenge
         words = shlex.split(said["command"])
