@@ -130,7 +130,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
             "seed_data": TRAINING.seed,
             "most_false": {kind.label: most for kind, most in MOST_FALSE.items()},
             "drawing": read(out / "drawing.json"),
-            "training": read(training / "training.json"),
+            "training": within(out, read(training / "training.json")),
         },
         "validation": sweep(validation, [g for g in GRID if g >= plain.confidence]),
     }
@@ -208,6 +208,12 @@ def counted(what: str, total: int) -> Any:
 
 def read(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+def within(folder: Path, facts: dict[str, Any]) -> dict[str, Any]:
+    """`facts` with paths as they are seen from `folder`: the card travels."""
+    here = f"{folder}/"
+    return {k: v.removeprefix(here) if isinstance(v, str) else v for k, v in facts.items()}
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -35,7 +35,7 @@ others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 
 | command | `{command}` |
 | sources | bikeped {bikeped}, commit {commit} |
 | seeds | pictures {seed_data}, training {seed}; validation and tests from seeds of their own |
-| drawing | {drawing_min:.0f} min |
+| drawing | {drawing_min:.0f} min{drawing_note} |
 | training | {steps} steps, {training_min:.0f} min |
 | first {packed:.0%} | {squares} squares of {side} pixels a step, full of windows around objects |
 | then | {windows} windows of 480 x 288 pixels a step |
@@ -78,6 +78,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         seed_data=made["seed_data"],
         seed=settings["seed"],
         drawing_min=made["drawing"]["seconds"] / 60,
+        drawing_note=made["drawing"].get("note", ""),
         training_min=training["seconds"] / 60,
         steps=settings["steps"],
         windows=settings["pictures"] * settings["windows"],
