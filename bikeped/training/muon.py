@@ -23,22 +23,24 @@ class Muon(torch.optim.Optimizer):
     def __init__(self, params: Iterable[torch.Tensor], lr: float, decay: float) -> None:
         super().__init__(params, {"lr": lr, "decay": decay})
 
-    @torch.no_grad()
     def step(self, closure: Any = None) -> None:
         """One step along the gradients."""
-        for group in self.param_groups:
-            for weight in group["params"]:
-                if weight.grad is None:
-                    continue
-                state = self.state[weight]
-                if not state:
-                    state["momentum"] = torch.zeros_like(weight)
-                state["momentum"].lerp_(weight.grad, 1 - _MOMENTUM)
-                ahead = weight.grad.lerp(state["momentum"], _MOMENTUM)
-                step = orthogonal(ahead.reshape(len(ahead), -1))
-                tall = max(1.0, step.shape[0] / step.shape[1]) ** 0.5
-                weight.mul_(1 - group["lr"] * group["decay"])
-                weight.sub_(step.reshape(weight.shape), alpha=group["lr"] * tall)
+        with torch.no_grad():
+            for group in self.param_groups:
+                for weight in group["params"]:
+                    if weight.grad is not None:
+                        self._move(weight, group["lr"], group["decay"])
+
+    def _move(self, weight: torch.Tensor, rate: float, decay: float) -> None:
+        state = self.state[weight]
+        if not state:
+            state["momentum"] = torch.zeros_like(weight)
+        state["momentum"].lerp_(weight.grad, 1 - _MOMENTUM)
+        ahead = weight.grad.lerp(state["momentum"], _MOMENTUM)
+        step = orthogonal(ahead.reshape(len(ahead), -1))
+        tall = max(1.0, step.shape[0] / step.shape[1]) ** 0.5
+        weight.mul_(1 - rate * decay)
+        weight.sub_(step.reshape(weight.shape), alpha=rate * tall)
 
 
 def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
