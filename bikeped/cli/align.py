@@ -10,13 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from bikeped.cli.common import (
-    FiniteRange,
-    config_options,
-    console,
-    json_option,
-    write_json,
-)
+from bikeped.cli.common import FiniteRange, config_options, console, json_option, write_json
 from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, framing, ground_camera, load_config
 from bikeped.errors import BikepedError, CaptureError

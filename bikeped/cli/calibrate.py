@@ -8,13 +8,8 @@ from pathlib import Path
 import click
 
 from bikeped.cli.calibrate_options import PATTERN, Asked
-from bikeped.cli.common import (
-    FiniteRange,
-    config_options,
-    console,
-    json_option,
-)
-from bikeped.cli.guard import check_outputs, guarded
+from bikeped.cli.common import FiniteRange, config_options, console, json_option
+from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.errors import BikepedError
 
 _MODELS = ("equidistant", "equisolid", "stereographic", "orthographic", "linear", "equalarea")
@@ -137,10 +132,11 @@ def command(
         if out is not None and target.exists():
             lens.append((f"{target}.bak, the former lens,", target.with_name(target.name + ".bak")))
         others = (("--report", report_path), ("--json", json_path))
+        named = [(name, path) for name, value in others for path in written_paths(value)]
         check_outputs(
             [("IMAGES", path) for path in images]
             + ([("-c", config_path)] if config_path is not None else []),
-            lens + [(name, Path(p)) for name, p in others if p is not None and p != "-"],
+            lens + named,
         )
     screen = console(json_path)
     asked = Asked.of(pattern, square_m, model, terms, board_shape, compare, folds or 0)

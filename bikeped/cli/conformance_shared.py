@@ -12,13 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from bikeped.cli.common import (
-    FiniteRange,
-    config_options,
-    console,
-    json_option,
-    write_json,
-)
+from bikeped.cli.common import FiniteRange, config_options, console, json_option, write_json
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 

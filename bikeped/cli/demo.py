@@ -14,7 +14,7 @@ from bikeped.cli.common import (
     progress_bar,
     write_json,
 )
-from bikeped.cli.guard import check_outputs, guarded
+from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.cli.web_options import open_pages, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.files import make_folder, write_whole
@@ -71,7 +71,7 @@ def command(
     check_outputs(
         [("-c", config_path)] if config_path is not None else [],
         [("--out", name) for name in names]
-        + ([("--json", Path(json_path))] if json_path not in (None, "-") else []),
+        + [("--json", name) for name in written_paths(json_path)],
     )
     scenario = load_scenario(bundled_scenario())
     painter = ScenePainter(scenario, scene_camera(loaded, SIZE), Conditions())

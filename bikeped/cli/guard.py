@@ -63,7 +63,7 @@ def guarded(command: F) -> F:
                 (_shown(k), path)
                 for k in _OUTPUTS
                 if k in given and not _is_folder(k, given)
-                for path in _written_paths(given[k])
+                for path in written_paths(given[k])
             ],
         )
         return command(**given)
@@ -123,8 +123,8 @@ def _is_folder(name: str, given: Mapping[str, Any]) -> bool:
     return name == "out" and given.get("dataset") is not None  # `scene --dataset N --out FOLDER`
 
 
-def _written_paths(value: Any) -> list[Path]:
-    """The paths of an output: none or one; `-` is standard output."""
+def written_paths(value: Any) -> list[Path]:
+    """The path of an output parameter: none, or one; `-` is standard output."""
     return [] if value is None or value == "-" else [Path(str(value))]
 
 

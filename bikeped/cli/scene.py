@@ -18,7 +18,7 @@ from bikeped.cli.common import (
     progress_bar,
     write_json,
 )
-from bikeped.cli.guard import check_outputs, guarded
+from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError, GeometryError, ScenarioError
 from bikeped.files import write_whole
@@ -125,7 +125,7 @@ def command(
     conditions = Conditions(seed=seed, light=light, weather=weather, place=place)
     view = _camera(loaded, wide_high)
     read = [("SCENARIO", source)] + ([("-c", config_path)] if config_path else [])
-    told = [("--json", Path(str(json_path)))] if json_path not in (None, "-") else []
+    told = [("--json", name) for name in written_paths(json_path)]
     if still is not None:
         if seconds is not None:
             raise BikepedError("--seconds: is for a clip; leave it out with --still")

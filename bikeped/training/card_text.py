@@ -138,7 +138,7 @@ def _measured(title: str, test: Mapping[str, Any]) -> str:
             "| distance | objects | recall | median error | 90 % below |",
             "| --- | ---: | ---: | ---: | ---: |",
             _row("within 15 m", numbers["within_15_m"]),
-            *_mostly(numbers),
+            _row("of them, 65 % or more visible", numbers["within_15_m_mostly_visible"]),
             *(_row(f"{r['from_m']:g} to {r['to_m']:g} m", r) for r in numbers["rings"]),
         ]
     lines += [
@@ -154,12 +154,6 @@ def _measured(title: str, test: Mapping[str, Any]) -> str:
             f"| {light} | {row['frames']} | {recalls} | {row['false_per_100_frames']:.1f} |"
         )
     return "\n".join(lines) + "\n"
-
-
-def _mostly(numbers: Mapping[str, Any]) -> list[str]:
-    """The row of those of whom 65 % shows; older measurements lack it."""
-    mostly = numbers.get("within_15_m_mostly_visible")
-    return [_row("of them, 65 % or more visible", mostly)] if mostly else []
 
 
 def _percent(value: float | None) -> str:

@@ -24,6 +24,7 @@ from bikeped.errors import DataSetError, DetectorError
 from bikeped.files import write_whole
 from bikeped.training.coco import CocoData
 from bikeped.training.crops import (
+    LARGEST_WINDOW_PX,
     Crop,
     CropSettings,
     Cutter,
@@ -47,8 +48,8 @@ class FitSettings:
 
     steps: int = 6000
     packed: float = 0.8  #: share of the steps, the first ones, that see windows laid side by side
-    pictures: int = 8  #: read for each of the other steps
-    windows: int = 1  #: cut from each of them
+    pictures: int = 8  #: read for each step
+    windows: int = 1  #: cut from each of them in the steps that see no squares
     rate: float = 2e-3  #: highest learning rate, of AdamW
     matrix_rate: float = 0.02  #: highest learning rate of the convolutions, of Muon; 0: AdamW's
     decay: float = 0.02  #: of the weights
@@ -252,10 +253,10 @@ class _Worker:
     def _squares(self, step: int) -> list[Crop]:
         """Windows laid side by side, from a pool of pictures that is renewed bit by bit."""
         pack, workers = self._settings.pack, self._settings.workers
-        read = pack.pictures if self._pool else max(pack.pool, pack.pictures)
         # The first step fills the pool; every later one reads on from there.
-        first = 0 if not self._pool else max(pack.pool, pack.pictures) + (step - 1) * pack.pictures
-        self._pool += self._views(range(first, first + read))
+        end = max(pack.pool, self._settings.pictures) + step * self._settings.pictures
+        first = end - self._settings.pictures if step else 0
+        self._pool += self._views(range(first, end))
         self._pool = self._pool[-(pack.pool // workers) :]
         random = np.random.default_rng([self._settings.seed, 4, step, self._part])
         return self._packer(self._pool, pack.squares // workers, random)
@@ -378,8 +379,11 @@ def _check(data: CocoData, settings: FitSettings) -> None:
         raise DataSetError(
             f"size {sides}: sides must be multiples of {STRIDES[-1]}; choose another --size"
         )
-    if settings.pack.side % BLOCK_PX or settings.pack.side % STRIDES[-1]:
-        raise DataSetError(f"squares of {settings.pack.side}: must be multiples of {BLOCK_PX}")
+    if settings.pack.side % BLOCK_PX or settings.pack.side > LARGEST_WINDOW_PX:
+        raise DataSetError(
+            f"squares of {settings.pack.side}: must be multiples of {BLOCK_PX}, and "
+            f"{LARGEST_WINDOW_PX} at most"
+        )
     if settings.pictures % settings.workers:
         raise DataSetError(
             f"batch {settings.pictures}: must be a multiple of {settings.workers}, so that each "

@@ -27,7 +27,6 @@ class PackSettings:
 
     side: int = 256  #: of a square, a multiple of `BLOCK_PX`
     squares: int = 16  #: for each step
-    pictures: int = 8  #: read anew for each step
     pool: int = 48  #: pictures that windows are cut from at any time
     empty: float = 0.1  #: share of windows where some other picture has an object
     room: float = 1.25  #: side of a window, in longest sides of its object

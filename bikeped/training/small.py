@@ -14,7 +14,6 @@ from bikeped.training.coco import CocoData
 from bikeped.training.crops import CropSettings
 from bikeped.training.export import export_network
 from bikeped.training.fit import FitSettings, fit, save_weights, settings_as_dict
-from bikeped.training.packing import PackSettings
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,6 @@ def train_small(
     settings = FitSettings(
         steps=order.steps,
         pictures=order.pictures,
-        pack=PackSettings(pictures=order.pictures),
         warmup=min(100, max(1, order.steps // 10)),
         workers=2 if on_cpu and order.pictures % 2 == 0 else 1,
         seed=order.seed,

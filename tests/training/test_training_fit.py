@@ -28,7 +28,7 @@ from bikeped.training.fit import (  # noqa: E402
 from bikeped.training.packing import PackSettings  # noqa: E402
 
 CROPS = CropSettings(view=(160, 96), window=(96, 64), light=0, cover=0)
-PACK = PackSettings(side=128, squares=2, pictures=2, pool=4)
+PACK = PackSettings(side=128, squares=2, pool=4)
 SETTINGS = FitSettings(
     steps=3, pictures=2, warmup=2, memory=0.9, bfloat16=False, crops=CROPS, pack=PACK
 )
@@ -160,6 +160,8 @@ def test_unusable_data_are_named(data, tmp_path):
         fit(data, replace(SETTINGS, crops=replace(CROPS, window=(90, 64))))
     with pytest.raises(DataSetError, match="multiples of 64"):
         fit(data, replace(SETTINGS, pack=replace(PACK, side=100)))
+    with pytest.raises(DataSetError, match="256 at most"):
+        fit(data, replace(SETTINGS, pack=replace(PACK, side=320)))
     with pytest.raises(DataSetError, match="--batch"):
         fit(data, replace(SETTINGS, pictures=3))
     empty = blobs(tmp_path / "empty", 1, 0)
