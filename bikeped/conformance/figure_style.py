@@ -11,7 +11,7 @@ import math
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 BLACK, GREY, LIGHT = "#1a1a1a", "#6b6b6b", "#d9d9d9"
 BLUE, SKY, GREEN = "#0072b2", "#56b4e9", "#009e73"
 ORANGE, RED, PURPLE = "#e69f00", "#d55e00", "#cc79a7"
+#: A line's dash as matplotlib takes it: a name, or an offset with lengths on and off.
+Dash: TypeAlias = "str | tuple[int, tuple[int, ...]]"
 #: One look a series, in order: colour, marker, dash.
-SERIES = (
+SERIES: tuple[tuple[str, str, Dash], ...] = (
     (BLUE, "o", "-"),
     (RED, "s", "--"),
     (GREEN, "^", "-."),
