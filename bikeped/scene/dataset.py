@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from bikeped.scene.chance import random_camera, random_scenario
 from bikeped.scene.clip import encode_jpeg
 from bikeped.scene.conditions import Conditions, random_conditions
 from bikeped.scene.labels import DrawnObject
-from bikeped.scene.painter import ScenePainter
+from bikeped.scene.painter import Box, ScenePainter
 from bikeped.types import ImageArray, Kind
 
 CATEGORIES = [{"id": kind.value + 1, "name": kind.label} for kind in Kind]
@@ -30,6 +30,17 @@ MIN_SIDE_PX = 5.0
 _PER_STREET = 4  #: pictures that share a street, which costs more than who is on it
 
 
+@dataclass(frozen=True)
+class DrawnPicture:
+    """One picture [h, w, 3] RGB, everybody in it, and what stands there without being anybody."""
+
+    image: ImageArray
+    objects: list[DrawnObject]
+    conditions: Conditions
+    camera: SceneCamera
+    furniture: list[tuple[str, Box]]  #: as `ScenePainter.furniture` has it
+
+
 def pictures(
     count: int,
     seed: int,
@@ -37,7 +48,7 @@ def pictures(
     *,
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
-) -> Iterator[tuple[ImageArray, list[DrawnObject], Conditions, SceneCamera]]:
+) -> Iterator[DrawnPicture]:
     """`count` drawn pictures with their objects: random scenarios, lights, weathers and places.
 
     `camera`: for all of them; None draws a camera for every street (`lens`: fisheye or
@@ -50,7 +61,7 @@ def pictures(
         rng = np.random.default_rng((seed, number, 59))
         painter = ScenePainter(random_scenario(seed * 1_000_003 + number), view, conditions)
         image, objects = painter.draw(float(rng.uniform(0.2, 5.8)))
-        yield image, objects, conditions, view
+        yield DrawnPicture(image, objects, conditions, view, painter.furniture())
 
 
 def write_dataset(
@@ -67,7 +78,9 @@ def write_dataset(
 
     The folder appears whole or not at all, so it must not be there yet (or be empty). Annotations
     carry `visible` (share), `distance_m`, `kind` and `ignore` beside COCO's keys; hardly visible or
-    tiny ones have `iscrowd` 1. Raises BikepedError when the folder is taken or not writable.
+    tiny ones have `iscrowd` 1. Images carry `conditions`, and in `furniture` what stands there and
+    is nobody: `what` it is, and its `bbox`, which may reach beyond the picture. Raises BikepedError
+    when the folder is taken or not writable.
     """
     if not 1 <= count <= 1_000_000:
         raise BikepedError(f"count: {count} is not 1 to 1000000 pictures")
@@ -87,20 +100,23 @@ def write_dataset(
         images: list[dict[str, Any]] = []
         notes: list[dict[str, Any]] = []
         drawn = pictures(count, seed, camera, size=size, lens=lens)
-        for number, (image, objects, conditions, _) in enumerate(drawn):
+        for number, one in enumerate(drawn):
             name = f"{number:06d}.jpg"
             quality = 78 + (seed * 7 + number * 5) % 18
-            (partial / "images" / name).write_bytes(encode_jpeg(image, quality))
+            (partial / "images" / name).write_bytes(encode_jpeg(one.image, quality))
             images.append(
                 {
                     "id": number + 1,
                     "file_name": name,
-                    "width": image.shape[1],
-                    "height": image.shape[0],
-                    "conditions": asdict(conditions),
+                    "width": one.image.shape[1],
+                    "height": one.image.shape[0],
+                    "conditions": asdict(one.conditions),
+                    "furniture": [{"what": w, "bbox": _bbox(box)} for w, box in one.furniture],
                 }
             )
-            notes += [_annotation(len(notes) + i + 1, number + 1, o) for i, o in enumerate(objects)]
+            notes += [
+                _annotation(len(notes) + i + 1, number + 1, o) for i, o in enumerate(one.objects)
+            ]
             if progress is not None:
                 progress(number + 1, count)
         data = {
@@ -132,7 +148,7 @@ def _annotation(number: int, image: int, item: DrawnObject) -> dict[str, Any]:
         "id": number,
         "image_id": image,
         "category_id": item.label.value + 1,
-        "bbox": [round(u1, 2), round(v1, 2), round(u2 - u1, 2), round(v2 - v1, 2)],
+        "bbox": _bbox(item.box_px),
         "area": round((u2 - u1) * (v2 - v1), 2),
         "iscrowd": int(hard),
         "ignore": int(hard),
@@ -140,3 +156,9 @@ def _annotation(number: int, image: int, item: DrawnObject) -> dict[str, Any]:
         "distance_m": round(item.distance_m, 3),
         "kind": item.kind,
     }
+
+
+def _bbox(box_px: Box) -> list[float]:
+    """COCO's x, y, width, height."""
+    u1, v1, u2, v2 = box_px
+    return [round(u1, 2), round(v1, 2), round(u2 - u1, 2), round(v2 - v1, 2)]

@@ -25,6 +25,7 @@ from bikeped.types import FloatArray, ImageArray
 _PATH_CLEAR_M = 1.1  #: fixtures nearer than this to somebody's path are left out
 _ROUND_PX = 90.0  #: figures smaller than this need no round limbs
 _USUAL = Conditions()
+Box = tuple[float, float, float, float]  #: u1, v1, u2, v2 in pixels of the picture
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,12 @@ class ScenePainter:
         ]
         standing.sort(key=lambda s: -s.sprite.away_m)
         self._fixtures = [_Shown(_fixed(s, -1 - i)) for i, s in enumerate(standing)]
+        width, height = camera.size
+        self._furniture: list[tuple[str, Box]] = [
+            (s.item.what, s.sprite.full_box_px)
+            for s in standing
+            if s.item.what != "car" and _touches(s.sprite.full_box_px, width, height)
+        ]
         self._looks = {
             agent.id: Looks.of(np.random.default_rng((conditions.seed, agent.id, 3)))
             for agent in scenario.agents
@@ -73,6 +80,11 @@ class ScenePainter:
         if self._last is not None and self._last[0] == t_s:
             return list(self._last[2])
         return self._labels(self._present(t_s))
+
+    def furniture(self) -> list[tuple[str, Box]]:
+        """What stands in the picture and is nobody (`Fixture.what`: lamp, sign, tree, bollard and
+        the like) and its whole silhouette u1, v1, u2, v2, also where somebody hides it."""
+        return list(self._furniture)
 
     def draw(self, t_s: float) -> tuple[ImageArray, list[DrawnObject]]:
         """Picture and objects at once."""
@@ -182,6 +194,10 @@ class ScenePainter:
         )
         order = {agent.id: i for i, agent in enumerate(self.scenario.agents)}
         return sorted(found, key=lambda o: order[o.id] if o.id >= 0 else len(order) - o.id)
+
+
+def _touches(box: Box, width: int, height: int) -> bool:
+    return box[0] < width and box[1] < height and box[2] > 0 and box[3] > 0
 
 
 def _fixed(standing: Standing, number: int) -> Candidate:

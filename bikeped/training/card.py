@@ -207,8 +207,7 @@ def _part(loaded: LoadedConfig, test: DrawnTest, number: int, count: int) -> lis
     camera = None if test.own_lens else scene_camera(loaded, test.size)
     drawn = pictures(count, test.seed + number, camera, size=test.size)
     return [
-        (encode_jpeg(image, _QUALITY), objects, view, conditions)
-        for image, objects, conditions, view in drawn
+        (encode_jpeg(one.image, _QUALITY), one.objects, one.camera, one.conditions) for one in drawn
     ]
 
 

@@ -8,7 +8,8 @@ does the work.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ class CropSettings:
     window: tuple[int, int] = (480, 288)
     around_object: float = 0.65  #: share of windows that are cut around an object
     around_usual: float = 0.2  #: share cut where some other picture has an object
-    scale: tuple[float, float] = (0.85, 1.3)
+    scale: tuple[float, float] = (0.85, 1.4)
     flip: float = 0.5
     cover: float = 0.15  #: share of windows with something in front of an object
     light: float = 0.7  #: share of windows whose light and colours are changed
@@ -57,6 +58,8 @@ class View:
     box_px: FloatArray
     class_id: IntArray
     crowd: IntArray  #: 1 where a box stands for many
+    #: What stands there and is nobody, where the data tell: kind of thing -> boxes [n, 4].
+    furniture_px: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 def class_ids(data: CocoData) -> dict[int, int]:
@@ -79,7 +82,26 @@ def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
         fit.forward(box).astype(np.float64),
         np.array([known[o.category_id] for o in found], np.int64),
         np.array([o.crowd for o in found], np.int64),
+        _furniture(image, fit),
     )
+
+
+def _furniture(image: CocoImage, fit: Letterbox) -> dict[str, FloatArray]:
+    """The part within the picture of every thing in the entry's `furniture`, in view pixels."""
+    found: dict[str, list[FloatArray]] = {}
+    edge = np.array([image.width, image.height] * 2, np.float64)
+    try:
+        for thing in image.entry.get("furniture", ()):
+            x, y, wide, high = (float(side) for side in thing["bbox"])
+            box = np.clip([x, y, x + wide, y + high], 0.0, edge)
+            if box[2] - box[0] >= 1 and box[3] - box[1] >= 1:
+                found.setdefault(str(thing["what"]), []).append(box)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataSetError(
+            f"{image.path}: its `furniture` (image {image.id}) is no list of what and bbox; "
+            "correct or remove it"
+        ) from error
+    return {what: fit.forward(np.array(boxes)).astype(np.float64) for what, boxes in found.items()}
 
 
 def usual_places(data: CocoData, size: tuple[int, int]) -> FloatArray:
@@ -124,13 +146,14 @@ class Cutter:
         view: View,
         random: np.random.Generator,
         window: tuple[int, int] | None = None,
-        around: int | None = None,
+        around: FloatArray | None = None,
         scale: float | None = None,
     ) -> Crop:
         """One window of `view`; of another size than the settings' where `window` says so.
 
-        `around`: number of the object that it must hold as far as it fits, -1 for none (somewhere
-        where some other picture has one); None leaves it to the settings.
+        `around`: the box [4] in pixels of the view that it must hold as far as it fits, or an empty
+        array for none (somewhere where some other picture has an object); None leaves it to the
+        settings.
         """
         width, height = window or self._settings.window
         scale = float(random.uniform(*self._settings.scale)) if scale is None else scale
@@ -165,7 +188,12 @@ class Cutter:
         return crop
 
     def _corner(
-        self, view: View, wide: float, high: float, random: np.random.Generator, around: int | None
+        self,
+        view: View,
+        wide: float,
+        high: float,
+        random: np.random.Generator,
+        around: FloatArray | None,
     ) -> tuple[float, float]:
         """Upper left corner of a window of `wide` x `high` pixels of the view."""
         across, down = self._settings.view
@@ -173,8 +201,8 @@ class Cutter:
         kind = random.random() - self._settings.around_object
         if around is not None:
             kind = 0.0  # where objects use to be, if not around this one
-        if around is not None and around >= 0:
-            box = view.box_px[around]
+        if around is not None and len(around):
+            box = around
             # Anywhere in the window, but whole; what is larger than the window fills it.
             slack = (wide, high) - (box[2:] - box[:2])
             left, top = box[:2] - random.uniform(0, 1, 2) * slack

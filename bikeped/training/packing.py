@@ -18,6 +18,7 @@ from bikeped.training.crops import Crop, CropSettings, Cutter, View
 from bikeped.types import BoolArray, FloatArray
 
 BLOCK_PX = 64
+_NARROW = 0.6  #: share of the windows around things that are one block wide, the others two
 _TRIES = 12  #: objects that did not fit in a row, until what is left gets empty windows
 
 
@@ -28,20 +29,23 @@ class PackSettings:
     side: int = 256  #: of a square, a multiple of `BLOCK_PX`
     squares: int = 16  #: for each step
     pool: int = 48  #: pictures that windows are cut from at any time
-    empty: float = 0.1  #: share of windows where some other picture has an object
+    empty: float = 0.08  #: share of windows where some other picture has an object
+    #: Share of windows around signs, bollards and other things that are nobody, where the data
+    #: tell of them: they are what is taken for somebody.
+    furniture: float = 0.14
     room: float = 1.25  #: side of a window, in longest sides of its object
     #: How often objects that need 1, 2, 3, 4 blocks are taken: the largest are the easiest.
-    taken: tuple[float, ...] = (1.0, 1.0, 0.7, 0.45)
+    taken: tuple[float, ...] = (1.0, 1.0, 0.85, 0.65)
     #: Share of each of the first classes; further ones share what is left.
     classes: tuple[float, ...] = (0.46, 0.42)
 
 
 @dataclass(frozen=True)
 class _Pick:
-    """Object `index` of `view`, or none (-1), at a scale; its window is `blocks` blocks wide."""
+    """A box of `view` (empty: none) at a scale; its window is `blocks` blocks wide."""
 
     view: View
-    index: int
+    box_px: FloatArray
     scale: float
     blocks: int
 
@@ -57,12 +61,12 @@ class Packer:
         side = self._settings.side // BLOCK_PX
         free = np.ones((count, side, side), np.bool_)
         placed: list[list[tuple[int, int, Crop]]] = [[] for _ in range(count)]
-        by_class = _by_class(pool)
+        by_class, things = _by_class(pool), _by_thing(pool)
         misses = 0
         while free.any():
-            pick = self._pick(pool, by_class, random) if misses < _TRIES else None
+            pick = self._pick(pool, by_class, things, random) if misses < _TRIES else None
             if pick is None:
-                pick = _Pick(pool[int(random.integers(len(pool)))], -1, 1.0, 1)
+                pick = _Pick(pool[int(random.integers(len(pool)))], np.zeros(0), 1.0, 1)
             spot = first_fit(free, pick.blocks)
             if spot is None:
                 misses += 1
@@ -77,11 +81,17 @@ class Packer:
         self,
         pool: Sequence[View],
         by_class: list[list[tuple[int, int]]],
+        things: dict[str, list[tuple[int, int]]],
         random: np.random.Generator,
     ) -> _Pick | None:
         """First the class, then one of its objects; None for a window with nobody in its middle."""
         settings = self._settings
-        if random.random() < settings.empty or not any(by_class):
+        what = random.random() - settings.empty
+        if what < 0:
+            return None
+        if what < settings.furniture and things:
+            return self._thing(pool, things, random)
+        if not any(by_class):
             return None
         share = random.random() - np.cumsum(settings.classes)
         rest = len(settings.classes)
@@ -97,13 +107,29 @@ class Packer:
         blocks = int(np.clip(np.ceil(longest / BLOCK_PX), 1, settings.side // BLOCK_PX))
         likely = settings.taken[min(blocks, len(settings.taken)) - 1]
         if random.random() >= likely:
-            return self._pick(pool, by_class, random)
-        return _Pick(pool[number], index, scale, blocks)
+            return self._pick(pool, by_class, things, random)
+        return _Pick(pool[number], box, scale, blocks)
+
+    def _thing(
+        self,
+        pool: Sequence[View],
+        things: dict[str, list[tuple[int, int]]],
+        random: np.random.Generator,
+    ) -> _Pick:
+        """A window about any spot of a thing: first the kind of thing, then one of them."""
+        kinds = sorted(things)
+        kind = kinds[int(random.integers(len(kinds)))]
+        number, index = things[kind][int(random.integers(len(things[kind])))]
+        box = pool[number].furniture_px[kind][index]
+        spot = box[:2] + random.uniform(0, 1, 2) * (box[2:] - box[:2])
+        blocks = 1 if random.random() < _NARROW else min(2, self._settings.side // BLOCK_PX)
+        scale = float(random.uniform(*self._scale))
+        return _Pick(pool[number], np.concatenate([spot, spot]), scale, blocks)
 
     def _cut(self, pick: _Pick, random: np.random.Generator) -> Crop:
         side = pick.blocks * BLOCK_PX
         return self._cutter(
-            pick.view, random, window=(side, side), around=pick.index, scale=pick.scale
+            pick.view, random, window=(side, side), around=pick.box_px, scale=pick.scale
         )
 
 
@@ -128,6 +154,15 @@ def _by_class(pool: Sequence[View]) -> list[list[tuple[int, int]]]:
     for number, view in enumerate(pool):
         for index in np.flatnonzero(view.crowd == 0).tolist():
             found[int(view.class_id[index])].append((number, index))
+    return found
+
+
+def _by_thing(pool: Sequence[View]) -> dict[str, list[tuple[int, int]]]:
+    """For every kind of thing: picture of the pool and number there of each of them."""
+    found: dict[str, list[tuple[int, int]]] = {}
+    for number, view in enumerate(pool):
+        for what, boxes in view.furniture_px.items():
+            found.setdefault(what, []).extend((number, index) for index in range(len(boxes)))
     return found
 
 

@@ -138,6 +138,9 @@ def test_a_data_set_is_coco_and_repeats(tmp_path: Path) -> None:
     assert [c["name"] for c in data["categories"]] == [kind.label for kind in Kind]
     assert len(data["images"]) == 5
     assert {n["category_id"] for n in data["annotations"]} <= {1, 2, 3}
+    for image in data["images"]:
+        assert image["furniture"]
+        assert all(set(thing) == {"what", "bbox"} for thing in image["furniture"])
     assert len({n["id"] for n in data["annotations"]}) == len(data["annotations"]) > 5
     for note in data["annotations"]:
         u, v, w, h = note["bbox"]

@@ -54,6 +54,21 @@ def test_same_arguments_give_the_same_bytes(view: SceneCamera, scenario: Scenari
     assert (wanted[0][0] != wanted[1][0]).any()
 
 
+def test_furniture_is_where_it_is_drawn(view: SceneCamera, scenario: Scenario) -> None:
+    painter = ScenePainter(scenario, view)
+    things = painter.furniture()
+    assert {"tree", "lamp", "signal"} <= {what for what, _ in things}
+    assert "car" not in {what for what, _ in things}  # a road user
+    bare = backdrop(view, painter.conditions).image.astype(int)
+    full = painter.frame(0.0).astype(int)
+    for what, (u1, v1, u2, v2) in things:
+        assert max(u1, 0) < min(u2, view.size[0])
+        assert max(v1, 0) < min(v2, view.size[1])
+        rows = slice(max(int(v1), 0), int(v2) + 1)
+        columns = slice(max(int(u1), 0), int(u2) + 1)
+        assert np.abs(full - bare)[rows, columns].max() > 8, what
+
+
 def test_a_picture_is_the_callers_own(view: SceneCamera, scenario: Scenario) -> None:
     painter = ScenePainter(scenario, view)
     image, objects = painter.draw(4.0)

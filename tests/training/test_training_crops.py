@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from coco_sets import annotation, write_set
+from coco_sets import annotation, edit, write_set
 
 from bikeped.detection.preprocess import PAD
 from bikeped.errors import DataSetError
@@ -119,6 +119,26 @@ def test_a_view_is_letterboxed_as_the_detector_does(tmp_path):
     assert view.class_id.tolist() == [1]
     assert class_ids(data) == {1: 0, 2: 1, 3: 2}
     np.testing.assert_allclose(usual_places(data, (320, 192)), [[52, 32]], atol=1e-4)
+
+
+def test_furniture_is_read_where_the_data_tell(tmp_path):
+    file = write_set(tmp_path / "set", [])
+    entry = read_coco(file).images[0].entry
+    things = [
+        {"what": "sign", "bbox": [10, 20, 30, 40]},
+        {"what": "tree", "bbox": [300, 200, 60, 60]},
+        {"what": "tree", "bbox": [400, 20, 30, 40]},  # beside the picture
+    ]
+    edit(file, images=[{**entry, "furniture": things}])
+    data = read_coco(file)
+    found = read_view(data, data.images[0], (320, 192)).furniture_px
+    assert sorted(found) == ["sign", "tree"]
+    np.testing.assert_allclose(found["sign"], [[40, 16, 64, 48]], atol=1e-4)
+    np.testing.assert_allclose(found["tree"], [[272, 160, 288, 192]], atol=1e-4)
+    edit(file, images=[{**entry, "furniture": [{"what": "sign"}]}])
+    data = read_coco(file)
+    with pytest.raises(DataSetError, match=r"001\.jpg: its `furniture` \(image 1\)"):
+        read_view(data, data.images[0], (320, 192))
 
 
 def test_a_damaged_picture_is_named(tmp_path):

@@ -13,7 +13,7 @@ from bikeped.training.crops import CropSettings, Cutter, View
 from bikeped.training.packing import BLOCK_PX, Packer, PackSettings, first_fit
 
 CROPS = CropSettings(view=(480, 320), scale=(1.0, 1.0), flip=0.0, cover=0, light=0)
-PLAIN = PackSettings(empty=0.0, taken=(1.0,))
+PLAIN = PackSettings(empty=0.0, furniture=0.0, taken=(1.0,))
 
 
 def street(boxes, kind=0, crowd=0):
@@ -110,5 +110,36 @@ def test_a_window_holds_its_object_whole_wherever_it_lies():
     cutter = Cutter(CROPS, 0, np.zeros((0, 2)))
     random = np.random.default_rng(1)
     for _ in range(50):
-        crop = cutter(SMALL, random, window=(BLOCK_PX, BLOCK_PX), around=0, scale=1.0)
+        crop = cutter(SMALL, random, window=(BLOCK_PX, BLOCK_PX), around=SMALL.box_px[0], scale=1.0)
         assert crop.box_px[0, 2:] - crop.box_px[0, :2] == pytest.approx([20, 40])
+
+
+def test_some_windows_hold_a_thing_and_nobody():
+    # A white pole far from anybody: a window about any spot of it is partly white.
+    view = street([(100, 100, 120, 140)])
+    view.rgb[20:220, 400:410] = 255
+    things = replace(view, furniture_px={"lamp": np.array([[400.0, 20, 410, 220]])})
+    (square,) = packer(replace(PLAIN, furniture=1.0))([things], 1, np.random.default_rng(0))
+    assert len(square.box_px) == 0
+    blocks = square.rgb[..., 0].reshape(4, BLOCK_PX, 4, BLOCK_PX).max(axis=(1, 3))
+    assert (blocks == 255).mean() > 0.7  # where two blocks no longer fit there are empty windows
+    # With somebody beside it, he is boxed; without the data's telling, nothing changes.
+    near = street([(380, 100, 398, 140)])
+    near = replace(near, furniture_px={"sign": np.array([[400.0, 100, 410, 140]])})
+    (square,) = packer(replace(PLAIN, furniture=1.0))([near], 1, np.random.default_rng(0))
+    assert len(square.box_px) > 2
+    (square,) = packer(replace(PLAIN, furniture=1.0))([SMALL], 1, np.random.default_rng(0))
+    assert len(square.box_px) == 16
+
+
+def test_every_kind_of_thing_comes_as_often():
+    # Twenty trees and one sign: half of the windows show the sign, which is grey.
+    view = street([])
+    view.rgb[100:140, 300:320] = 255
+    view.rgb[100:140, 100:120] = 100
+    trees = np.repeat(np.array([[300.0, 100, 320, 140]]), 20, axis=0)
+    view = replace(view, furniture_px={"tree": trees, "sign": np.array([[100.0, 100, 120, 140]])})
+    squares = packer(replace(PLAIN, furniture=1.0))([view], 40, np.random.default_rng(0))
+    tops = np.stack([s.rgb[..., 0].reshape(4, BLOCK_PX, 4, BLOCK_PX).max((1, 3)) for s in squares])
+    grey, white = (tops == 100).sum(), (tops == 255).sum()
+    assert 0.35 < grey / (grey + white) < 0.65
