@@ -47,7 +47,7 @@ class FitSettings:
     """How long and how the network learns."""
 
     steps: int = 6000
-    packed: float = 0.8  #: share of the steps, the first ones, that see windows laid side by side
+    packed: float = 0.85  #: share of the steps, the first ones, that see windows laid side by side
     pictures: int = 8  #: read for each step
     windows: int = 1  #: cut from each of them in the steps that see no squares
     rate: float = 2e-3  #: highest learning rate, of AdamW
