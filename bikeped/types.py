@@ -64,6 +64,28 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Strip:
+    """The rows of a frame that are looked at, from its top down, as shares of its height.
+
+    `aspect` is the whole frame's width over its height. Scaled copies of a frame have the same
+    strip. Raises ValueError for a strip without rows.
+    """
+
+    top: float
+    bottom: float
+    aspect: float
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.top < self.bottom <= 1 and self.aspect > 0):
+            raise ValueError(f"no rows of a frame: {self}")
+
+    def rows_of(self, height_px: int) -> tuple[int, int]:
+        """First row and the one after the last, of a copy of the frame that is so tall."""
+        first = min(round(self.top * height_px), height_px - 1)
+        return first, max(round(self.bottom * height_px), first + 1)
+
+
+@dataclass(frozen=True)
 class Detections:
     """What the detector found in one frame, most confident first.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,13 @@ from bikeped.errors import DetectorError
     show_default=True,
     help="Side of the square input of a YOLO; the small network knows its own.",
 )
+@click.option(
+    "--input",
+    "input_size",
+    metavar="WIDTHxHEIGHT",
+    help="Size of the engine's input, multiples of 32, for a model that takes any. "
+    "Default: what the model says.",
+)
 @click.option("--full-precision", is_flag=True, help="An engine without 16-bit floats.")
 @click.option(
     "--workspace-mb",
@@ -47,6 +55,7 @@ def command(
     out: Path | None,
     engine: Path | None,
     size: int,
+    input_size: str | None,
     full_precision: bool,
     workspace_mb: int,
     json_path: str | None,
@@ -73,7 +82,13 @@ def command(
         from bikeped.training.engine import build_engine
 
         _expect(engine, ".engine")
-        built = build_engine(model, engine, half=not full_precision, workspace_mb=workspace_mb)
+        built = build_engine(
+            model,
+            engine,
+            half=not full_precision,
+            workspace_mb=workspace_mb,
+            size=None if input_size is None else _size(input_size),
+        )
         summary |= built.as_dict()
     if json_path is not None:
         write_json(summary, json_path)
@@ -85,6 +100,16 @@ def command(
 def _expect(path: Path, suffix: str) -> None:
     if path.suffix.lower() != suffix:
         raise DetectorError(f"{path}: bikeped knows a model by its name; end it with {suffix}")
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
+    sides = tuple(int(side) for side in match.groups()) if match else ()
+    if len(sides) != 2 or any(side % 32 or side == 0 for side in sides):
+        raise DetectorError(
+            f"--input {text}: is no WIDTHxHEIGHT in multiples of 32; for example 1280x416"
+        )
+    return sides[0], sides[1]
 
 
 def _print(summary: dict[str, Any]) -> None:

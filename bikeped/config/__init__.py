@@ -1,6 +1,12 @@
 """The whole configuration, as typed sections: load, check, override, hash."""
 
-from bikeped.config.build import framing, ground_camera, rule_settings, tracker_settings
+from bikeped.config.build import (
+    framing,
+    ground_camera,
+    road_strip,
+    rule_settings,
+    tracker_settings,
+)
 from bikeped.config.calibration import Calibration, load_calibration
 from bikeped.config.load import (
     LoadedConfig,
@@ -54,6 +60,7 @@ __all__ = [
     "load_calibration",
     "load_config",
     "parse_config",
+    "road_strip",
     "rule_settings",
     "tracker_settings",
 ]

@@ -12,7 +12,9 @@ from bikeped.config.sections import DecisionConfig, TrackingConfig
 from bikeped.decision import RuleSettings
 from bikeped.errors import ConfigError, GeometryError
 from bikeped.geometry import Framing, GroundCamera, Lens, canonical_projection
+from bikeped.geometry import road_strip as strip_of
 from bikeped.tracking import TrackerSettings
+from bikeped.types import Strip
 
 
 def rule_settings(decision: DecisionConfig) -> RuleSettings:
@@ -109,3 +111,11 @@ def ground_camera(loaded: LoadedConfig) -> GroundCamera:
         )
     except GeometryError as error:
         raise ConfigError(f"{loaded.source}: camera: {error}") from error
+
+
+def road_strip(loaded: LoadedConfig) -> Strip:
+    """Rows of the configured camera's frames that road users within the decision's range are in.
+
+    Raises ConfigError as `ground_camera` does.
+    """
+    return strip_of(ground_camera(loaded), framing(loaded), loaded.config.decision.max_range_m)

@@ -191,6 +191,14 @@ class DetectionConfig(Section, frozen=True):
             "yolox-legacy (before 0.1.1): RGB/255, ImageNet mean and deviation, top-left"
         ),
     ] = "auto"
+    region: Annotated[
+        Literal["auto", "road", "frame"],
+        Meta(
+            description="what is shown to the model; road: the rows where road users within "
+            "decision.max_range_m can be, by height and pitch of the camera; frame: all; auto: "
+            "road where the model's input can be of that height, which is quicker, else frame"
+        ),
+    ] = "auto"
     confidence: Annotated[
         float, Meta(ge=0.001, le=1, description="smallest confidence that is kept")
     ] = 0.1

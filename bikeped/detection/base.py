@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 from bikeped.detection.hashing import checked_sha256
 from bikeped.errors import DetectorError
 from bikeped.models import model_file
-from bikeped.types import Detections, ImageArray
+from bikeped.types import Detections, ImageArray, Strip
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -61,12 +61,13 @@ class Detector(Protocol):
         ...
 
 
-def load_detector(config: DetectionConfig, base_dir: Path) -> Detector:
+def load_detector(config: DetectionConfig, base_dir: Path, road: Strip | None = None) -> Detector:
     """The detector that `detection` describes, warmed up: the first frame is no slower than others.
 
     `base_dir` is the folder that a relative `detection.model` starts from; `bundled` is the model
-    that comes with bikeped. Raises `DetectorError`
-    where there is no model, its hash differs, or it cannot be run or understood.
+    that comes with bikeped. `road`: the rows of the camera's frames that road users can be in, for
+    `detection.region`; None: unknown, all are shown. Raises `DetectorError` where there is no
+    model, its hash differs, or it cannot be run or understood.
     """
     if config.model is None:
         raise DetectorError(
@@ -77,11 +78,11 @@ def load_detector(config: DetectionConfig, base_dir: Path) -> Detector:
     if path.suffix.lower() == ".onnx":
         from bikeped.detection.onnx_runtime import OnnxDetector
 
-        return OnnxDetector(path, config, checked_sha256(path, config.sha256))
+        return OnnxDetector(path, config, checked_sha256(path, config.sha256), road)
     if path.suffix.lower() == ".engine":
         from bikeped.detection.trt_engine import EngineDetector
 
-        return EngineDetector(path, config, checked_sha256(path, config.sha256))
+        return EngineDetector(path, config, checked_sha256(path, config.sha256), road=road)
     raise DetectorError(
         f"detection.model: {path} is neither .onnx nor .engine; export the model to one of them"
     )

@@ -8,18 +8,27 @@ value. Nothing is evaluated: `ast.literal_eval` accepts literals only.
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import DetectorError
+from bikeped.types import Strip
+
+if TYPE_CHECKING:
+    from bikeped.config.sections import DetectionConfig
 
 _LONGEST_LITERAL = 1 << 20
 _DEFAULT_SIZE = 640  #: Ultralytics' default, where neither the shape nor the metadata names one
 _LARGEST_SIDE = 16384
+_COARSEST = 32  #: YOLO networks want sides that are multiples of their largest stride
+#: Grey above and below a strip, together: whom the picture's edge cuts off was learnt with grey
+#: beyond it, too.
+_EDGE_PX = 16
 _INPUT_TYPES = (np.dtype(np.float32), np.dtype(np.float16), np.dtype(np.uint8))
 
 
@@ -80,11 +89,13 @@ def resolve_input(
     dtype: npt.DTypeLike,
     metadata: ModelMetadata,
     source: str,
+    strip: Strip | None = None,
 ) -> InputSpec:
     """The input with every dynamic dimension filled in.
 
     `shape` is as the runtime gives it: integers, and names, None or -1 where dynamic. A dynamic
-    height or width is the metadata's `imgsz`, else 640. Raises `DetectorError` for any other input.
+    height or width is the metadata's `imgsz`, else 640; with `strip` a dynamic height is no more
+    than holds the strip at the input's width. Raises `DetectorError` for any other input.
     """
     if len(shape) != 4:
         raise DetectorError(
@@ -101,7 +112,12 @@ def resolve_input(
             "three channels first"
         )
     known_width, known_height = metadata.image_size or (_DEFAULT_SIZE, _DEFAULT_SIZE)
+    free = height is None
     width, height = width or known_width, height or known_height
+    if free and strip is not None:
+        rows = width / strip.aspect * (strip.bottom - strip.top)
+        wanted = math.ceil((rows + _EDGE_PX) / _COARSEST) * _COARSEST
+        height = min(wanted, max(height, _COARSEST))
     if not (32 <= width <= _LARGEST_SIDE and 32 <= height <= _LARGEST_SIDE):
         raise DetectorError(
             f"{source}: input {name} is {width} x {height}; sides of 32 to {_LARGEST_SIDE} can be "
@@ -113,6 +129,16 @@ def resolve_input(
             f"{source}: input {name} is {kind}; export with float32, float16 or uint8 input"
         )
     return InputSpec(name, width, height, kind)
+
+
+def is_free(shape: Sequence[object]) -> bool:
+    """Whether the input's height may be chosen."""
+    return len(shape) == 4 and not (isinstance(shape[2], int) and shape[2] > 0)
+
+
+def choose_strip(config: DetectionConfig, road: Strip | None, free: bool) -> Strip | None:
+    """The rows that are shown by `detection.region`, None for all; `free` as `is_free` has it."""
+    return road if config.region == "road" or (config.region == "auto" and free) else None
 
 
 def _literal(value: object) -> object:

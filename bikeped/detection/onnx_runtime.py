@@ -10,9 +10,16 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from bikeped.detection.facts import ModelMetadata, parse_metadata, resolve_input
+from bikeped.detection.facts import (
+    ModelMetadata,
+    choose_strip,
+    is_free,
+    parse_metadata,
+    resolve_input,
+)
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DetectorError
+from bikeped.types import Strip
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -35,15 +42,23 @@ _ERRORS_ONLY = 3  #: ONNX Runtime's log severity; its warnings are about optimis
 class OnnxDetector(NetworkDetector):
     """A `Detector` for an `.onnx` file."""
 
-    def __init__(self, path: Path, config: DetectionConfig, model_hash: str) -> None:
-        """Opens and warms up the model. Raises `DetectorError` where that fails."""
-        super().__init__(path, config, model_hash, OnnxBackend(path, config, model_hash))
+    def __init__(
+        self, path: Path, config: DetectionConfig, model_hash: str, road: Strip | None = None
+    ) -> None:
+        """Opens and warms up the model; `road` as `load_detector` has it.
+
+        Raises `DetectorError` where that fails.
+        """
+        backend = OnnxBackend(path, config, model_hash, road)
+        super().__init__(path, config, model_hash, backend, backend.strip)
 
 
 class OnnxBackend:
     """An ONNX Runtime session with one input array that is reused."""
 
-    def __init__(self, path: Path, config: DetectionConfig, model_hash: str) -> None:
+    def __init__(
+        self, path: Path, config: DetectionConfig, model_hash: str, road: Strip | None = None
+    ) -> None:
         """`model_hash` names the folder of the engines that TensorRT builds.
 
         ONNX Runtime names a cached engine after the graph, not the weights: without a folder of its
@@ -87,7 +102,10 @@ class OnnxBackend:
                 f"{path}: input {inputs[0].name} is {inputs[0].type}; export with float32, float16 "
                 "or uint8 input"
             )
-        spec = resolve_input(inputs[0].name, inputs[0].shape, kind, self.metadata, self._source)
+        self.strip = choose_strip(config, road, is_free(inputs[0].shape))
+        spec = resolve_input(
+            inputs[0].name, inputs[0].shape, kind, self.metadata, self._source, self.strip
+        )
         self.buffer: npt.NDArray[Any] = spec.buffer()
         self._feed = {spec.name: self.buffer}
         self._names: list[str] = [output.name for output in self._session.get_outputs()]

@@ -7,6 +7,7 @@ output arrays. All the rest is the same for both, and lives in the pure modules 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -24,7 +25,7 @@ from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.detection.riders import join_riders
 from bikeped.detection.weights import first_layer
 from bikeped.errors import DetectorError
-from bikeped.types import Detections, Float32Array, ImageArray, IntArray, Kind, KindArray
+from bikeped.types import Detections, Float32Array, ImageArray, IntArray, Kind, KindArray, Strip
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -65,9 +66,17 @@ class NetworkDetector:
     """A `Detector` around a backend."""
 
     def __init__(
-        self, path: Path, config: DetectionConfig, model_hash: str, backend: Backend
+        self,
+        path: Path,
+        config: DetectionConfig,
+        model_hash: str,
+        backend: Backend,
+        strip: Strip | None = None,
     ) -> None:
-        """Runs the network on a grey picture: it warms up, and its answer shows the layout."""
+        """Runs the network on a grey picture: it warms up, and its answer shows the layout.
+
+        `strip`: the rows of every frame that it is shown; None: all.
+        """
         self._backend = backend
         self._config = config
         self._source = str(path)
@@ -95,13 +104,16 @@ class NetworkDetector:
             self._kind_of_class == Kind.CYCLIST, config.confidence * faint, config.confidence
         ).astype(np.float32)
         family, why = _family(choice.layout, metadata, config, path)
-        self._preprocess = Preprocessor(family, backend.buffer)
+        self._preprocess = Preprocessor(family, backend.buffer, strip)
         log.info(
-            "%s: %s, input %d x %d, layout %s (%s), preprocessing %s (%s), %d classes",
+            "%s: %s, input %d x %d, shown %s, layout %s (%s), preprocessing %s (%s), %d classes",
             path,
             backend.description,
             width,
             height,
+            "all of the frame"
+            if strip is None
+            else f"its rows from {strip.top:.1%} to {strip.bottom:.1%} (the road)",
             choice.layout,
             choice.reason,
             family,
@@ -137,9 +149,15 @@ class NetworkDetector:
         return self._preprocess.family
 
     def decode_size(self, frame_width: int, frame_height: int) -> tuple[int, int]:
-        """The size of the picture's part on the network's input, never more than the frame."""
+        """The size at which a frame is as large as on the network's input, never more than its own.
+
+        Of the whole frame, also where only some of its rows are shown.
+        """
         box = self._preprocess.letterbox(frame_width, frame_height)
-        return min(box.width, frame_width), min(box.height, frame_height)
+        share = (box.last_row - box.first_row) / frame_height
+        # A scaled copy that is a rounding taller would be decoded at twice the size.
+        whole = math.floor(box.height / share + 1e-6)
+        return min(box.width, frame_width), min(whole, frame_height)
 
     def infer(self, rgb: ImageArray, frame_width: int, frame_height: int) -> DetectorAnswer:
         """See `Detector.infer`."""
@@ -217,9 +235,10 @@ class NetworkDetector:
 
 
 def _on_frame(box: Float32Array, where: Letterbox) -> Float32Array:
-    """Boxes [n, 4] in input pixels in pixels of the frame, clipped to it."""
-    edge = np.array([where.frame_width, where.frame_height] * 2, np.float32)
-    clipped: Float32Array = np.minimum(np.maximum(where.inverse(box), np.float32(0)), edge)
+    """Boxes [n, 4] in input pixels in pixels of the frame, clipped to what of it was shown."""
+    x1, y1, x2, y2 = where.shown_px
+    low, high = (np.array(side * 2, np.float32) for side in ((x1, y1), (x2, y2)))
+    clipped: Float32Array = np.minimum(np.maximum(where.inverse(box), low), high)
     return clipped
 
 

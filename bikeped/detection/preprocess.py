@@ -5,7 +5,8 @@
     yolox-legacy  RGB / 255 less ImageNet's mean over its deviation, top left (YOLOX before 0.1.1)
 
 The picture may have been decoded at a reduced scale; boxes are mapped with the full frame's size,
-so they land on full-frame pixels whatever the scale was.
+so they land on full-frame pixels whatever the scale was. With a strip only its rows are shown, as
+if they were the whole picture.
 
 What it costs is one bilinear resize and one table look-up a channel, straight into the network's
 contiguous input: a byte has 256 values, so the table folds scale, mean and deviation, exactly. Only
@@ -21,7 +22,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.types import Float32Array, FloatArray, ImageArray
+from bikeped.types import Float32Array, FloatArray, ImageArray, Strip
 
 Family = Literal["ultralytics", "yolox", "yolox-legacy"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
@@ -33,7 +34,7 @@ _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Where a frame lies on the network's input, in whole pixels of the input.
+    """Where a frame, or some of its rows, lies on the network's input, in whole pixels of it.
 
     The two axes have their own scale: the picture's part is rounded to whole pixels.
     """
@@ -44,22 +45,30 @@ class Letterbox:
     top: int
     width: int  #: of the picture's part
     height: int
+    first_row: float  #: of the frame's rows that lie there
+    last_row: float  #: the one after the last
 
     @staticmethod
     def fit(
-        frame_width: int, frame_height: int, size: tuple[int, int], family: Family
+        frame_width: int,
+        frame_height: int,
+        size: tuple[int, int],
+        family: Family,
+        rows: tuple[float, float] | None = None,
     ) -> Letterbox:
         """The largest fit of a frame into an input of `size` (width, height), aspect kept.
 
-        Raises `ValueError` for a frame or an input without area.
+        `rows`: first of the frame's rows and the one after the last that are to lie there; None:
+        all. Raises `ValueError` for a frame or an input without area.
         """
         across, down = size
         if min(frame_width, frame_height, across, down) < 1:
             raise ValueError(
                 f"cannot letterbox {frame_width} x {frame_height} into {across} x {down}"
             )
-        ratio = min(across / frame_width, down / frame_height)
-        wide, high = frame_width * ratio, frame_height * ratio
+        first, last = rows or (0.0, float(frame_height))
+        ratio = min(across / frame_width, down / (last - first))
+        wide, high = frame_width * ratio, (last - first) * ratio
         if family == "ultralytics":
             width, height = round(wide), round(high)
         else:  # YOLOX cuts; the slack keeps 1280 * (416 / 1280) from becoming 415
@@ -67,30 +76,40 @@ class Letterbox:
         width, height = min(max(width, 1), across), min(max(height, 1), down)
         centred = family == "ultralytics"
         left, top = ((across - width) // 2, (down - height) // 2) if centred else (0, 0)
-        return Letterbox(frame_width, frame_height, left, top, width, height)
+        return Letterbox(frame_width, frame_height, left, top, width, height, first, last)
+
+    @property
+    def shown_px(self) -> tuple[float, float, float, float]:
+        """The part of the frame that lies on the input: x1, y1, x2, y2 in frame pixels."""
+        return 0.0, self.first_row, float(self.frame_width), self.last_row
 
     def forward(self, box: npt.NDArray[Any]) -> Float32Array:
         """Boxes [n, 4] (x1, y1, x2, y2) from frame pixels to input pixels."""
-        sx, sy = self.width / self.frame_width, self.height / self.frame_height
+        sx, sy = self.width / self.frame_width, self.height / (self.last_row - self.first_row)
         scale = np.array([sx, sy, sx, sy])
-        moved: npt.NDArray[np.float64] = box * scale + np.array([self.left, self.top] * 2)
+        shift = np.array([self.left, self.top - self.first_row * sy] * 2)
+        moved: npt.NDArray[np.float64] = box * scale + shift
         return moved.astype(np.float32)
 
     def inverse(self, box: npt.NDArray[Any]) -> Float32Array:
         """Boxes [n, 4] from input pixels to frame pixels; not clipped to the frame."""
-        sx, sy = self.frame_width / self.width, self.frame_height / self.height
+        sx, sy = self.frame_width / self.width, (self.last_row - self.first_row) / self.height
         moved: npt.NDArray[np.float64] = box - np.array([self.left, self.top] * 2, np.float64)
         moved *= np.array([sx, sy, sx, sy])
+        moved += np.array([0.0, self.first_row] * 2)
         return moved.astype(np.float32)
 
 
 class Preprocessor:
     """Fills one network's input buffer, frame after frame. Not for several threads at once."""
 
-    def __init__(self, family: Family, buffer: npt.NDArray[Any]) -> None:
+    def __init__(
+        self, family: Family, buffer: npt.NDArray[Any], strip: Strip | None = None
+    ) -> None:
         """`buffer` is the network's input, [1, 3, height, width], float32, float16 or uint8.
 
-        A uint8 input gets the bytes as they are: such a network scales them itself.
+        A uint8 input gets the bytes as they are: such a network scales them itself. `strip`: the
+        rows of every frame that are shown; None: all.
         """
         if buffer.ndim != 4 or buffer.shape[:2] != (1, 3) or not buffer.flags.c_contiguous:
             raise ValueError(
@@ -99,24 +118,35 @@ class Preprocessor:
         self.family = family
         self.buffer = buffer
         self.size = (int(buffer.shape[3]), int(buffer.shape[2]))
+        self.strip = strip
         # Channel of the network -> channel of the picture, which is RGB.
         self._source = (2, 1, 0) if family == "yolox" else (0, 1, 2)
         self._tables = _tables(family, self._source, buffer.dtype)
         # OpenCV has no look-up into half precision: its bits travel as 16-bit integers.
         self._planes = buffer[0].view(np.int16) if buffer.dtype == np.float16 else buffer[0]
         self._letterbox: Letterbox | None = None
+        self._copy_height = 0
         self._picture: ImageArray = np.zeros((0, 0, 3), np.uint8)
         self._channel: ImageArray = np.zeros((0, 0), np.uint8)
 
-    def letterbox(self, frame_width: int, frame_height: int) -> Letterbox:
-        """How a frame of this size lies on the input."""
+    def letterbox(self, frame_width: int, frame_height: int, copy_height: int = 0) -> Letterbox:
+        """How a frame of this size lies on the input.
+
+        `copy_height`: of the scaled copy that is shown, whose rows are whole ones; 0: the frame's.
+        """
+        copy_height = copy_height or frame_height
         last = self._letterbox
-        if last is not None and (last.frame_width, last.frame_height) == (
+        if last is not None and (last.frame_width, last.frame_height, self._copy_height) == (
             frame_width,
             frame_height,
+            copy_height,
         ):
             return last
-        return Letterbox.fit(frame_width, frame_height, self.size, self.family)
+        rows = None
+        if self.strip is not None and copy_height > 0:
+            first, end = self.strip.rows_of(copy_height)
+            rows = first * frame_height / copy_height, end * frame_height / copy_height
+        return Letterbox.fit(frame_width, frame_height, self.size, self.family, rows)
 
     def __call__(self, rgb: ImageArray, frame_width: int, frame_height: int) -> Letterbox:
         """Writes `rgb` [h, w, 3] uint8, of any scale, into the buffer; returns where it lies.
@@ -124,13 +154,16 @@ class Preprocessor:
         Raises `ValueError` where `rgb` is no such picture or has another aspect than the frame.
         """
         _check_picture(rgb, frame_width, frame_height)
-        box = self.letterbox(frame_width, frame_height)
+        box = self.letterbox(frame_width, frame_height, rgb.shape[0])
         if box is not self._letterbox:
             for plane, table in zip(self._planes, self._tables, strict=True):
                 plane[...] = table[PAD]
             self._picture = np.empty((box.height, box.width, 3), np.uint8)
             self._channel = np.empty((box.height, box.width), np.uint8)
-            self._letterbox = box
+            self._letterbox, self._copy_height = box, rgb.shape[0]
+        if self.strip is not None:
+            first, end = self.strip.rows_of(rgb.shape[0])
+            rgb = rgb[first:end]
         picture = rgb
         if rgb.shape[:2] != (box.height, box.width):
             cv2.resize(rgb, (box.width, box.height), dst=self._picture)

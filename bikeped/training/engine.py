@@ -43,12 +43,18 @@ class EngineSummary:
 
 
 def build_engine(
-    model: Path, out: Path, *, half: bool = True, workspace_mb: int = 2048
+    model: Path,
+    out: Path,
+    *,
+    half: bool = True,
+    workspace_mb: int = 2048,
+    size: tuple[int, int] | None = None,
 ) -> EngineSummary:
     """Builds `out` from the ONNX file `model`; takes minutes. Raises DetectorError.
 
     `half` lets TensorRT use 16-bit floats where the GPU has fast ones; `workspace_mb` bounds the
-    memory that it tries plans with.
+    memory that it tries plans with. `size`: width and height of the input of a model that takes
+    any; None: what its metadata say.
     """
     trt = _tensorrt(out)
     try:
@@ -56,7 +62,7 @@ def build_engine(
     except OSError as error:
         raise DetectorError(f"{model}: cannot be read ({error.strerror})") from error
     facts = onnx_facts(model)
-    parse_metadata(facts, str(model))  # what the loader would refuse is refused now
+    known = parse_metadata(facts, str(model))  # what the loader would refuse is refused now
     logger = trt.Logger(trt.Logger.WARNING)
     builder = trt.Builder(logger)
     # TensorRT 10 knows explicit batches only, and takes no flag for them.
@@ -69,6 +75,7 @@ def build_engine(
             "export with a lower opset"
         )
     config = builder.create_builder_config()
+    _fix_size(network, builder, config, size or known.image_size, size is not None, model)
     config.set_memory_pool_limit(trt.MemoryPoolType.WORKSPACE, workspace_mb * _MB)
     half = half and bool(builder.platform_has_fast_fp16)
     if half:
@@ -83,6 +90,36 @@ def build_engine(
     data = len(header).to_bytes(4, "little") + header + bytes(plan)
     write_whole(out, data)
     return EngineSummary(out, model, len(data), str(trt.__version__), half)
+
+
+def _fix_size(
+    network: Any,
+    builder: Any,
+    config: Any,
+    size: tuple[int, int] | None,
+    asked: bool,
+    model: Path,
+) -> None:
+    """Gives an input that may have any size the one that it will have; a fixed one must have it."""
+    taken = network.get_input(0)
+    shape = list(taken.shape)
+    if len(shape) != 4:
+        return  # the loader says what is wrong with it
+    if all(side > 0 for side in shape):
+        if asked and size is not None and (shape[3], shape[2]) != size:
+            raise DetectorError(
+                f"{model}: its input is {shape[3]} x {shape[2]}, not {size[0]} x {size[1]}; leave "
+                "out --input, or export the model for any size"
+            )
+        return
+    if size is None:
+        raise DetectorError(
+            f"{model}: takes pictures of any size and does not say which; name one with --input"
+        )
+    whole = (1, 3, size[1], size[0])
+    profile = builder.create_optimization_profile()
+    profile.set_shape(taken.name, whole, whole, whole)  # smallest, usual, largest
+    config.add_optimization_profile(profile)
 
 
 def onnx_facts(model: Path) -> dict[str, str]:

@@ -120,18 +120,17 @@ class Exported(nn.Module):
     Rows: centre u, centre v, width, height in pixels of the input, then a score in 0..1 a class.
     """
 
-    def __init__(self, network: SmallNet, width: int, height: int) -> None:
+    def __init__(self, network: SmallNet) -> None:
         super().__init__()
         self.network = network
-        centre, stride = grid(width, height)
-        self.register_buffer("centre", centre.T[None].contiguous())
-        self.register_buffer("stride", stride[None, None])
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         score, edge = self.network(images)
+        # From the picture itself: the exported network serves every size.
+        centre, stride = grid(images.shape[3], images.shape[2])
         low, high = edge[:, :2], edge[:, 2:]
-        middle = self.centre + (high - low) * (self.stride / 2)
-        return torch.cat([middle, (low + high) * self.stride, score.sigmoid()], 1)
+        middle = centre.T[None] + (high - low) * (stride / 2)
+        return torch.cat([middle, (low + high) * stride, score.sigmoid()], 1)
 
 
 def grid(width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -142,7 +141,7 @@ def grid(width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
             torch.arange(height // stride), torch.arange(width // stride), indexing="ij"
         )
         centres.append((torch.stack([u.flatten(), v.flatten()], 1) + 0.5) * stride)
-        strides.append(torch.full((u.numel(),), float(stride)))
+        strides.append(torch.full_like(centres[-1][:, 0], float(stride)))
     return torch.cat(centres), torch.cat(strides)
 
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.detection.preprocess import FAMILIES, Letterbox, Preprocessor
+from bikeped.types import Strip
 
 MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
@@ -137,3 +138,58 @@ def test_bad_buffers_and_sizes_are_refused():
         Preprocessor("yolox", np.zeros((1, 64, 64, 3), np.float32))
     with pytest.raises(ValueError, match="cannot letterbox"):
         Letterbox.fit(0, 10, (64, 64), "yolox")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_of_a_strip_the_network_sees_just_its_rows(family):
+    rgb = picture(96, 64)
+    shown = Preprocessor(family, np.zeros((1, 3, 64, 64), np.float32), Strip(0.5, 1.0, 64 / 96))
+    where = shown(rgb, 64, 96)
+    cut = Preprocessor(family, np.zeros((1, 3, 64, 64), np.float32))
+    cut(rgb[48:], 64, 48)
+    np.testing.assert_array_equal(shown.buffer, cut.buffer)
+    assert where.shown_px == (0, 48, 64, 96)
+    box = np.array([[10.0, 60.0, 20.0, 90.0]])
+    np.testing.assert_allclose(where.inverse(where.forward(box)), box)
+
+
+def test_a_strip_of_a_smaller_copy_lies_in_the_same_place():
+    full = np.zeros((400, 800, 3), np.uint8)
+    full[200:, 400:] = 200
+    run = Preprocessor("ultralytics", np.zeros((1, 3, 64, 128), np.float32), Strip(0.4, 1.0, 2.0))
+    where = run(full, 800, 400)
+    first = run.buffer.copy()
+    half = run(np.ascontiguousarray(full[::2, ::2]), 800, 400)
+    assert (half.left, half.top, half.width, half.height) == (
+        where.left,
+        where.top,
+        where.width,
+        where.height,
+    )
+    assert np.abs(run.buffer - first).mean() < 0.01
+    # 400 rows in thirds: a copy's rows are whole ones, and boxes land by them.
+    third = run(picture(133, 267), 800, 400)
+    assert third.first_row == pytest.approx(53 * 400 / 133)
+    np.testing.assert_allclose(
+        third.inverse(third.forward(np.array([[0, 200, 800, 400]]))),
+        [[0, 200, 800, 400]],
+        atol=1e-3,
+    )
+
+
+@given(
+    st.sampled_from(FAMILIES),
+    st.tuples(st.integers(64, 4000), st.integers(64, 4000)),
+    st.tuples(st.integers(32, 1280), st.integers(32, 1280)),
+    st.floats(0, 0.8),
+    st.lists(st.floats(0, 1), min_size=4, max_size=4),
+)
+def test_boxes_of_a_strip_come_back(family, frame, size, top, share):
+    first, last = top * frame[1], float(frame[1])
+    where = Letterbox.fit(*frame, size, family, (first, last))
+    low, high = np.array([0, first] * 2), np.array([frame[0], last] * 2)
+    box = low + np.array([share]) * (high - low)
+    inside = where.forward(box)
+    assert (inside >= -1e-2).all()
+    assert (inside <= np.array(size * 2) + 1e-2).all()
+    np.testing.assert_allclose(where.inverse(inside), box, atol=max(frame) * 2e-4)

@@ -26,9 +26,31 @@ class MemoryPoolType(enum.Enum):
     WORKSPACE = 0
 
 
+class Profile:
+    def set_shape(self, name, least, usual, most):
+        self.shape = name, least, usual, most
+
+
+class Network:
+    """What was parsed, with its input's shape as TensorRT tells it: -1 where any will do."""
+
+    content = b""
+    num_inputs = 1
+
+    def get_input(self, number):
+        taken = onnx.load_model_from_string(self.content).graph.input[number]
+        sides = taken.type.tensor_type.shape.dim
+        return types.SimpleNamespace(
+            name=taken.name, shape=tuple(-1 if d.dim_param else d.dim_value for d in sides)
+        )
+
+
 class Config:
     def __init__(self):
-        self.flags, self.limits = set(), {}
+        self.flags, self.limits, self.profiles = set(), {}, []
+
+    def add_optimization_profile(self, profile):
+        self.profiles.append(profile.shape)
 
     def set_flag(self, flag):
         self.flags.add(flag)
@@ -46,7 +68,7 @@ class Parser:
 
     def parse(self, content):
         onnx.checker.check_model(onnx.load_model_from_string(content))
-        self.network["content"] = content
+        self.network.content = content
         return not self.errors
 
     def get_error(self, number):
@@ -63,14 +85,17 @@ class Builder:
 
     def create_network(self, flags):
         assert flags == 0
-        return {}
+        return Network()
+
+    def create_optimization_profile(self):
+        return Profile()
 
     def create_builder_config(self):
         Builder.last = Config()
         return Builder.last
 
     def build_serialized_network(self, network, config):
-        assert network["content"]
+        assert network.content
         return self.plan
 
 
@@ -96,14 +121,16 @@ def trt(monkeypatch):
 @pytest.fixture
 def model(tmp_path):
     """An ONNX file that does nothing, with metadata."""
-    shape = [1, 3, 64, 96]
+    return nothing(tmp_path / "model.onnx", [1, 3, 64, 96])
+
+
+def nothing(path, shape, facts=FACTS):
     ends = [helper.make_tensor_value_info(n, TensorProto.FLOAT, shape) for n in ("images", "out")]
     graph = helper.make_graph(
         [helper.make_node("Identity", ["images"], ["out"])], "nothing", ends[:1], ends[1:]
     )
     proto = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(proto, FACTS)
-    path = tmp_path / "model.onnx"
+    helper.set_model_props(proto, facts)
     path.write_bytes(proto.SerializeToString())
     return path
 
@@ -118,6 +145,22 @@ def test_an_engine_carries_the_facts_in_front(trt, model, tmp_path):
     assert summary.half
     assert Builder.last.flags == {BuilderFlag.FP16}
     assert Builder.last.limits == {MemoryPoolType.WORKSPACE: 64 << 20}
+
+
+def test_an_input_of_any_size_gets_the_one_it_will_have(trt, model, tmp_path):
+    free = nothing(tmp_path / "free.onnx", [1, 3, "height", "width"])
+    build_engine(free, tmp_path / "a.engine")
+    assert Builder.last.profiles == [("images", *[(1, 3, 64, 96)] * 3)]  # as its metadata say
+    build_engine(free, tmp_path / "b.engine", size=(128, 32))
+    assert Builder.last.profiles == [("images", *[(1, 3, 32, 128)] * 3)]
+    build_engine(model, tmp_path / "c.engine", size=(96, 64))
+    assert Builder.last.profiles == []
+    with pytest.raises(DetectorError, match=r"its input is 96 x 64, not 128 x 32; leave out"):
+        build_engine(model, tmp_path / "d.engine", size=(128, 32))
+    silent = nothing(tmp_path / "silent.onnx", [1, 3, "height", "width"], {})
+    with pytest.raises(DetectorError, match="name one with --input"):
+        build_engine(silent, tmp_path / "d.engine")
+    assert not (tmp_path / "d.engine").exists()
 
 
 def test_half_precision_only_where_it_is_asked_for_and_there(trt, model, tmp_path):
