@@ -64,25 +64,34 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Strip:
-    """The rows of a frame that are looked at, from its top down, as shares of its height.
+class Region:
+    """The part of a frame that is looked at, as shares of its width and height from the top left.
 
     `aspect` is the whole frame's width over its height. Scaled copies of a frame have the same
-    strip. Raises ValueError for a strip without rows.
+    region. Raises ValueError for one without area.
     """
 
+    left: float
     top: float
+    right: float
     bottom: float
     aspect: float
 
     def __post_init__(self) -> None:
-        if not (0 <= self.top < self.bottom <= 1 and self.aspect > 0):
-            raise ValueError(f"no rows of a frame: {self}")
+        across = 0 <= self.left < self.right <= 1
+        if not (across and 0 <= self.top < self.bottom <= 1 and self.aspect > 0):
+            raise ValueError(f"no part of a frame: {self}")
 
-    def rows_of(self, height_px: int) -> tuple[int, int]:
-        """First row and the one after the last, of a copy of the frame that is so tall."""
-        first = min(round(self.top * height_px), height_px - 1)
-        return first, max(round(self.bottom * height_px), first + 1)
+    def pixels(self, width_px: int, height_px: int) -> tuple[int, int, int, int]:
+        """First column and row, and those after the last, in a copy of the frame of this size."""
+        u1 = min(round(self.left * width_px), width_px - 1)
+        v1 = min(round(self.top * height_px), height_px - 1)
+        return (
+            u1,
+            v1,
+            max(round(self.right * width_px), u1 + 1),
+            max(round(self.bottom * height_px), v1 + 1),
+        )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from bikeped.config.build import (
     framing,
     ground_camera,
-    road_strip,
+    road_region,
     rule_settings,
     tracker_settings,
 )
@@ -60,7 +60,7 @@ __all__ = [
     "load_calibration",
     "load_config",
     "parse_config",
-    "road_strip",
+    "road_region",
     "rule_settings",
     "tracker_settings",
 ]

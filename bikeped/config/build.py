@@ -12,9 +12,9 @@ from bikeped.config.sections import DecisionConfig, TrackingConfig
 from bikeped.decision import RuleSettings
 from bikeped.errors import ConfigError, GeometryError
 from bikeped.geometry import Framing, GroundCamera, Lens, canonical_projection
-from bikeped.geometry import road_strip as strip_of
+from bikeped.geometry import road_region as region_of
 from bikeped.tracking import TrackerSettings
-from bikeped.types import Strip
+from bikeped.types import Region
 
 
 def rule_settings(decision: DecisionConfig) -> RuleSettings:
@@ -113,9 +113,9 @@ def ground_camera(loaded: LoadedConfig) -> GroundCamera:
         raise ConfigError(f"{loaded.source}: camera: {error}") from error
 
 
-def road_strip(loaded: LoadedConfig) -> Strip:
-    """Rows of the configured camera's frames that road users within the decision's range are in.
+def road_region(loaded: LoadedConfig) -> Region:
+    """The part of the camera's frames that road users within the decision's range can be in.
 
     Raises ConfigError as `ground_camera` does.
     """
-    return strip_of(ground_camera(loaded), framing(loaded), loaded.config.decision.max_range_m)
+    return region_of(ground_camera(loaded), framing(loaded), loaded.config.decision.max_range_m)

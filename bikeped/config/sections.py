@@ -194,7 +194,7 @@ class DetectionConfig(Section, frozen=True):
     region: Annotated[
         Literal["auto", "road", "frame"],
         Meta(
-            description="what is shown to the model; road: the rows where road users within "
+            description="what is shown to the model; road: the part where road users within "
             "decision.max_range_m can be, by height and pitch of the camera; frame: all; auto: "
             "road where the model's input can be of that height, which is quicker, else frame"
         ),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 from bikeped.detection.hashing import checked_sha256
 from bikeped.errors import DetectorError
 from bikeped.models import model_file
-from bikeped.types import Detections, ImageArray, Strip
+from bikeped.types import Detections, ImageArray, Region
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -61,11 +61,11 @@ class Detector(Protocol):
         ...
 
 
-def load_detector(config: DetectionConfig, base_dir: Path, road: Strip | None = None) -> Detector:
+def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None = None) -> Detector:
     """The detector that `detection` describes, warmed up: the first frame is no slower than others.
 
     `base_dir` is the folder that a relative `detection.model` starts from; `bundled` is the model
-    that comes with bikeped. `road`: the rows of the camera's frames that road users can be in, for
+    that comes with bikeped. `road`: the part of the camera's frames that road users can be in, for
     `detection.region`; None: unknown, all are shown. Raises `DetectorError` where there is no
     model, its hash differs, or it cannot be run or understood.
     """

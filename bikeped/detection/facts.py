@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import DetectorError
-from bikeped.types import Strip
+from bikeped.types import Region
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -26,9 +26,9 @@ _LONGEST_LITERAL = 1 << 20
 _DEFAULT_SIZE = 640  #: Ultralytics' default, where neither the shape nor the metadata names one
 _LARGEST_SIDE = 16384
 _COARSEST = 32  #: YOLO networks want sides that are multiples of their largest stride
-#: Grey above and below a strip, together: whom the picture's edge cuts off was learnt with grey
+#: Grey above and below the region, together: whom the picture's edge cuts off was learnt with grey
 #: beyond it, too.
-_EDGE_PX = 16
+_EDGE_PX = 12
 _INPUT_TYPES = (np.dtype(np.float32), np.dtype(np.float16), np.dtype(np.uint8))
 
 
@@ -89,13 +89,14 @@ def resolve_input(
     dtype: npt.DTypeLike,
     metadata: ModelMetadata,
     source: str,
-    strip: Strip | None = None,
+    region: Region | None = None,
 ) -> InputSpec:
     """The input with every dynamic dimension filled in.
 
     `shape` is as the runtime gives it: integers, and names, None or -1 where dynamic. A dynamic
-    height or width is the metadata's `imgsz`, else 640; with `strip` a dynamic height is no more
-    than holds the strip at the input's width. Raises `DetectorError` for any other input.
+    height or width is the metadata's `imgsz`, else 640; with `region` a dynamic height is no more
+    than holds the region, which fills the input's width. Raises `DetectorError` for any other
+    input.
     """
     if len(shape) != 4:
         raise DetectorError(
@@ -114,8 +115,9 @@ def resolve_input(
     known_width, known_height = metadata.image_size or (_DEFAULT_SIZE, _DEFAULT_SIZE)
     free = height is None
     width, height = width or known_width, height or known_height
-    if free and strip is not None:
-        rows = width / strip.aspect * (strip.bottom - strip.top)
+    if free and region is not None:
+        shape_of_it = region.aspect * (region.right - region.left) / (region.bottom - region.top)
+        rows = width / shape_of_it
         wanted = math.ceil((rows + _EDGE_PX) / _COARSEST) * _COARSEST
         height = min(wanted, max(height, _COARSEST))
     if not (32 <= width <= _LARGEST_SIDE and 32 <= height <= _LARGEST_SIDE):
@@ -136,8 +138,11 @@ def is_free(shape: Sequence[object]) -> bool:
     return len(shape) == 4 and not (isinstance(shape[2], int) and shape[2] > 0)
 
 
-def choose_strip(config: DetectionConfig, road: Strip | None, free: bool) -> Strip | None:
-    """The rows that are shown by `detection.region`, None for all; `free` as `is_free` has it."""
+def choose_region(config: DetectionConfig, road: Region | None, free: bool) -> Region | None:
+    """The part of every frame that is shown by `detection.region`, None for all.
+
+    `free` as `is_free` has it.
+    """
     return road if config.region == "road" or (config.region == "auto" and free) else None
 
 

@@ -12,14 +12,14 @@ import onnxruntime as ort
 
 from bikeped.detection.facts import (
     ModelMetadata,
-    choose_strip,
+    choose_region,
     is_free,
     parse_metadata,
     resolve_input,
 )
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DetectorError
-from bikeped.types import Strip
+from bikeped.types import Region
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -43,21 +43,21 @@ class OnnxDetector(NetworkDetector):
     """A `Detector` for an `.onnx` file."""
 
     def __init__(
-        self, path: Path, config: DetectionConfig, model_hash: str, road: Strip | None = None
+        self, path: Path, config: DetectionConfig, model_hash: str, road: Region | None = None
     ) -> None:
         """Opens and warms up the model; `road` as `load_detector` has it.
 
         Raises `DetectorError` where that fails.
         """
         backend = OnnxBackend(path, config, model_hash, road)
-        super().__init__(path, config, model_hash, backend, backend.strip)
+        super().__init__(path, config, model_hash, backend, backend.region)
 
 
 class OnnxBackend:
     """An ONNX Runtime session with one input array that is reused."""
 
     def __init__(
-        self, path: Path, config: DetectionConfig, model_hash: str, road: Strip | None = None
+        self, path: Path, config: DetectionConfig, model_hash: str, road: Region | None = None
     ) -> None:
         """`model_hash` names the folder of the engines that TensorRT builds.
 
@@ -102,9 +102,9 @@ class OnnxBackend:
                 f"{path}: input {inputs[0].name} is {inputs[0].type}; export with float32, float16 "
                 "or uint8 input"
             )
-        self.strip = choose_strip(config, road, is_free(inputs[0].shape))
+        self.region = choose_region(config, road, is_free(inputs[0].shape))
         spec = resolve_input(
-            inputs[0].name, inputs[0].shape, kind, self.metadata, self._source, self.strip
+            inputs[0].name, inputs[0].shape, kind, self.metadata, self._source, self.region
         )
         self.buffer: npt.NDArray[Any] = spec.buffer()
         self._feed = {spec.name: self.buffer}

@@ -25,7 +25,7 @@ from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.detection.riders import join_riders
 from bikeped.detection.weights import first_layer
 from bikeped.errors import DetectorError
-from bikeped.types import Detections, Float32Array, ImageArray, IntArray, Kind, KindArray, Strip
+from bikeped.types import Detections, Float32Array, ImageArray, IntArray, Kind, KindArray, Region
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -71,11 +71,11 @@ class NetworkDetector:
         config: DetectionConfig,
         model_hash: str,
         backend: Backend,
-        strip: Strip | None = None,
+        region: Region | None = None,
     ) -> None:
         """Runs the network on a grey picture: it warms up, and its answer shows the layout.
 
-        `strip`: the rows of every frame that it is shown; None: all.
+        `region`: the part of every frame that it is shown; None: all.
         """
         self._backend = backend
         self._config = config
@@ -104,16 +104,14 @@ class NetworkDetector:
             self._kind_of_class == Kind.CYCLIST, config.confidence * faint, config.confidence
         ).astype(np.float32)
         family, why = _family(choice.layout, metadata, config, path)
-        self._preprocess = Preprocessor(family, backend.buffer, strip)
+        self._preprocess = Preprocessor(family, backend.buffer, region)
         log.info(
             "%s: %s, input %d x %d, shown %s, layout %s (%s), preprocessing %s (%s), %d classes",
             path,
             backend.description,
             width,
             height,
-            "all of the frame"
-            if strip is None
-            else f"its rows from {strip.top:.1%} to {strip.bottom:.1%} (the road)",
+            "all of the frame" if region is None else f"the road ({_shares(region)})",
             choice.layout,
             choice.reason,
             family,
@@ -151,13 +149,14 @@ class NetworkDetector:
     def decode_size(self, frame_width: int, frame_height: int) -> tuple[int, int]:
         """The size at which a frame is as large as on the network's input, never more than its own.
 
-        Of the whole frame, also where only some of its rows are shown.
+        Of the whole frame, also where only a part of it is shown.
         """
         box = self._preprocess.letterbox(frame_width, frame_height)
-        share = (box.last_row - box.first_row) / frame_height
-        # A scaled copy that is a rounding taller would be decoded at twice the size.
-        whole = math.floor(box.height / share + 1e-6)
-        return min(box.width, frame_width), min(whole, frame_height)
+        x1, y1, x2, y2 = box.shown_px
+        # Down to whole pixels: a copy that is a rounding smaller costs half of the decoding.
+        wide = math.floor(box.width * frame_width / (x2 - x1) + 1e-6)
+        high = math.floor(box.height * frame_height / (y2 - y1) + 1e-6)
+        return min(wide, frame_width), min(high, frame_height)
 
     def infer(self, rgb: ImageArray, frame_width: int, frame_height: int) -> DetectorAnswer:
         """See `Detector.infer`."""
@@ -232,6 +231,13 @@ class NetworkDetector:
         """
         group = np.where(kind == Kind.CYCLIST, Kind.PEDESTRIAN, kind) if self._whole else kind
         return suppress(box, score, group, self._config.iou, self._config.max_detections)
+
+
+def _shares(region: Region) -> str:
+    return (
+        f"from {region.left:.1%} to {region.right:.1%} across, "
+        f"from {region.top:.1%} to {region.bottom:.1%} down"
+    )
 
 
 def _on_frame(box: Float32Array, where: Letterbox) -> Float32Array:

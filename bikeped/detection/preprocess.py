@@ -5,8 +5,8 @@
     yolox-legacy  RGB / 255 less ImageNet's mean over its deviation, top left (YOLOX before 0.1.1)
 
 The picture may have been decoded at a reduced scale; boxes are mapped with the full frame's size,
-so they land on full-frame pixels whatever the scale was. With a strip only its rows are shown, as
-if they were the whole picture.
+so they land on full-frame pixels whatever the scale was. With a region only that is shown, as if it
+were the whole picture.
 
 What it costs is one bilinear resize and one table look-up a channel, straight into the network's
 contiguous input: a byte has 256 values, so the table folds scale, mean and deviation, exactly. Only
@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.types import Float32Array, FloatArray, ImageArray, Strip
+from bikeped.types import Float32Array, FloatArray, ImageArray, Region
 
 Family = Literal["ultralytics", "yolox", "yolox-legacy"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
@@ -34,7 +34,7 @@ _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Where a frame, or some of its rows, lies on the network's input, in whole pixels of it.
+    """Where a frame, or a part of it, lies on the network's input, in whole pixels of it.
 
     The two axes have their own scale: the picture's part is rounded to whole pixels.
     """
@@ -45,8 +45,8 @@ class Letterbox:
     top: int
     width: int  #: of the picture's part
     height: int
-    first_row: float  #: of the frame's rows that lie there
-    last_row: float  #: the one after the last
+    #: The part of the frame that lies there: x1, y1, x2, y2 in frame pixels.
+    shown_px: tuple[float, float, float, float]
 
     @staticmethod
     def fit(
@@ -54,21 +54,21 @@ class Letterbox:
         frame_height: int,
         size: tuple[int, int],
         family: Family,
-        rows: tuple[float, float] | None = None,
+        part_px: tuple[float, float, float, float] | None = None,
     ) -> Letterbox:
         """The largest fit of a frame into an input of `size` (width, height), aspect kept.
 
-        `rows`: first of the frame's rows and the one after the last that are to lie there; None:
-        all. Raises `ValueError` for a frame or an input without area.
+        `part_px`: the part (x1, y1, x2, y2 in frame pixels) that is to lie there; None: all. Raises
+        `ValueError` for a frame or an input without area.
         """
         across, down = size
         if min(frame_width, frame_height, across, down) < 1:
             raise ValueError(
                 f"cannot letterbox {frame_width} x {frame_height} into {across} x {down}"
             )
-        first, last = rows or (0.0, float(frame_height))
-        ratio = min(across / frame_width, down / (last - first))
-        wide, high = frame_width * ratio, (last - first) * ratio
+        x1, y1, x2, y2 = part_px or (0.0, 0.0, float(frame_width), float(frame_height))
+        ratio = min(across / (x2 - x1), down / (y2 - y1))
+        wide, high = (x2 - x1) * ratio, (y2 - y1) * ratio
         if family == "ultralytics":
             width, height = round(wide), round(high)
         else:  # YOLOX cuts; the slack keeps 1280 * (416 / 1280) from becoming 415
@@ -76,40 +76,38 @@ class Letterbox:
         width, height = min(max(width, 1), across), min(max(height, 1), down)
         centred = family == "ultralytics"
         left, top = ((across - width) // 2, (down - height) // 2) if centred else (0, 0)
-        return Letterbox(frame_width, frame_height, left, top, width, height, first, last)
-
-    @property
-    def shown_px(self) -> tuple[float, float, float, float]:
-        """The part of the frame that lies on the input: x1, y1, x2, y2 in frame pixels."""
-        return 0.0, self.first_row, float(self.frame_width), self.last_row
+        return Letterbox(frame_width, frame_height, left, top, width, height, (x1, y1, x2, y2))
 
     def forward(self, box: npt.NDArray[Any]) -> Float32Array:
         """Boxes [n, 4] (x1, y1, x2, y2) from frame pixels to input pixels."""
-        sx, sy = self.width / self.frame_width, self.height / (self.last_row - self.first_row)
-        scale = np.array([sx, sy, sx, sy])
-        shift = np.array([self.left, self.top - self.first_row * sy] * 2)
-        moved: npt.NDArray[np.float64] = box * scale + shift
+        scale = np.array([self.width, self.height] * 2) / (self._shown_size * 2)
+        moved: npt.NDArray[np.float64] = (box - np.array(self.shown_px[:2] * 2)) * scale
+        moved += np.array([self.left, self.top] * 2)
         return moved.astype(np.float32)
 
     def inverse(self, box: npt.NDArray[Any]) -> Float32Array:
         """Boxes [n, 4] from input pixels to frame pixels; not clipped to the frame."""
-        sx, sy = self.frame_width / self.width, (self.last_row - self.first_row) / self.height
         moved: npt.NDArray[np.float64] = box - np.array([self.left, self.top] * 2, np.float64)
-        moved *= np.array([sx, sy, sx, sy])
-        moved += np.array([0.0, self.first_row] * 2)
+        moved *= np.array(self._shown_size * 2) / np.array([self.width, self.height] * 2)
+        moved += np.array(self.shown_px[:2] * 2)
         return moved.astype(np.float32)
+
+    @property
+    def _shown_size(self) -> tuple[float, float]:
+        x1, y1, x2, y2 = self.shown_px
+        return x2 - x1, y2 - y1
 
 
 class Preprocessor:
     """Fills one network's input buffer, frame after frame. Not for several threads at once."""
 
     def __init__(
-        self, family: Family, buffer: npt.NDArray[Any], strip: Strip | None = None
+        self, family: Family, buffer: npt.NDArray[Any], region: Region | None = None
     ) -> None:
         """`buffer` is the network's input, [1, 3, height, width], float32, float16 or uint8.
 
-        A uint8 input gets the bytes as they are: such a network scales them itself. `strip`: the
-        rows of every frame that are shown; None: all.
+        A uint8 input gets the bytes as they are: such a network scales them itself. `region`: the
+        part of every frame that is shown; None: all.
         """
         if buffer.ndim != 4 or buffer.shape[:2] != (1, 3) or not buffer.flags.c_contiguous:
             raise ValueError(
@@ -118,35 +116,39 @@ class Preprocessor:
         self.family = family
         self.buffer = buffer
         self.size = (int(buffer.shape[3]), int(buffer.shape[2]))
-        self.strip = strip
+        self.region = region
         # Channel of the network -> channel of the picture, which is RGB.
         self._source = (2, 1, 0) if family == "yolox" else (0, 1, 2)
         self._tables = _tables(family, self._source, buffer.dtype)
         # OpenCV has no look-up into half precision: its bits travel as 16-bit integers.
         self._planes = buffer[0].view(np.int16) if buffer.dtype == np.float16 else buffer[0]
         self._letterbox: Letterbox | None = None
-        self._copy_height = 0
+        self._copy_size = (0, 0)
         self._picture: ImageArray = np.zeros((0, 0, 3), np.uint8)
         self._channel: ImageArray = np.zeros((0, 0), np.uint8)
 
-    def letterbox(self, frame_width: int, frame_height: int, copy_height: int = 0) -> Letterbox:
+    def letterbox(
+        self, frame_width: int, frame_height: int, copy_size: tuple[int, int] | None = None
+    ) -> Letterbox:
         """How a frame of this size lies on the input.
 
-        `copy_height`: of the scaled copy that is shown, whose rows are whole ones; 0: the frame's.
+        `copy_size`: width and height of the scaled copy that is shown, of which whole pixels are
+        cut; None: the frame's own.
         """
-        copy_height = copy_height or frame_height
+        copy_size = copy_size or (frame_width, frame_height)
         last = self._letterbox
-        if last is not None and (last.frame_width, last.frame_height, self._copy_height) == (
-            frame_width,
-            frame_height,
-            copy_height,
+        if (
+            last is not None
+            and (last.frame_width, last.frame_height) == (frame_width, frame_height)
+            and self._copy_size == copy_size
         ):
             return last
-        rows = None
-        if self.strip is not None and copy_height > 0:
-            first, end = self.strip.rows_of(copy_height)
-            rows = first * frame_height / copy_height, end * frame_height / copy_height
-        return Letterbox.fit(frame_width, frame_height, self.size, self.family, rows)
+        part = None
+        if self.region is not None and min(copy_size) > 0:
+            across, down = frame_width / copy_size[0], frame_height / copy_size[1]
+            u1, v1, u2, v2 = self.region.pixels(*copy_size)
+            part = u1 * across, v1 * down, u2 * across, v2 * down
+        return Letterbox.fit(frame_width, frame_height, self.size, self.family, part)
 
     def __call__(self, rgb: ImageArray, frame_width: int, frame_height: int) -> Letterbox:
         """Writes `rgb` [h, w, 3] uint8, of any scale, into the buffer; returns where it lies.
@@ -154,16 +156,17 @@ class Preprocessor:
         Raises `ValueError` where `rgb` is no such picture or has another aspect than the frame.
         """
         _check_picture(rgb, frame_width, frame_height)
-        box = self.letterbox(frame_width, frame_height, rgb.shape[0])
+        copy_size = rgb.shape[1], rgb.shape[0]
+        box = self.letterbox(frame_width, frame_height, copy_size)
         if box is not self._letterbox:
             for plane, table in zip(self._planes, self._tables, strict=True):
                 plane[...] = table[PAD]
             self._picture = np.empty((box.height, box.width, 3), np.uint8)
             self._channel = np.empty((box.height, box.width), np.uint8)
-            self._letterbox, self._copy_height = box, rgb.shape[0]
-        if self.strip is not None:
-            first, end = self.strip.rows_of(rgb.shape[0])
-            rgb = rgb[first:end]
+            self._letterbox, self._copy_size = box, copy_size
+        if self.region is not None:
+            u1, v1, u2, v2 = self.region.pixels(*copy_size)
+            rgb = rgb[v1:v2, u1:u2]
         picture = rgb
         if rgb.shape[:2] != (box.height, box.width):
             cv2.resize(rgb, (box.width, box.height), dst=self._picture)

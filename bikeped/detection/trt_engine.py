@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.detection.cuda import Cuda
-from bikeped.detection.facts import ModelMetadata, choose_strip, parse_metadata, resolve_input
+from bikeped.detection.facts import ModelMetadata, choose_region, parse_metadata, resolve_input
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DetectorError
-from bikeped.types import Strip
+from bikeped.types import Region
 
 if TYPE_CHECKING:
     from bikeped.config.sections import DetectionConfig
@@ -50,14 +50,14 @@ class EngineDetector(NetworkDetector):
         config: DetectionConfig,
         model_hash: str,
         cuda: Cuda | None = None,
-        road: Strip | None = None,
+        road: Region | None = None,
     ) -> None:
         """Loads and warms up the engine; `road` as `load_detector` has it.
 
         Raises `DetectorError` where that fails.
         """
-        strip = choose_strip(config, road, False)  # an engine's input is of one size
-        super().__init__(path, config, model_hash, EngineBackend(path, cuda), strip)
+        region = choose_region(config, road, False)  # an engine's input is of one size
+        super().__init__(path, config, model_hash, EngineBackend(path, cuda), region)
 
 
 def split_header(data: bytes) -> tuple[Mapping[str, object], memoryview]:

@@ -4,7 +4,7 @@ from bikeped.geometry.camera import CameraPose, GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.geometry.ground import GroundTable
 from bikeped.geometry.lens import Lens, Projection, canonical_projection
-from bikeped.geometry.road import road_strip
+from bikeped.geometry.road import road_region
 
 __all__ = [
     "CameraPose",
@@ -14,5 +14,5 @@ __all__ = [
     "Lens",
     "Projection",
     "canonical_projection",
-    "road_strip",
+    "road_region",
 ]

@@ -6,7 +6,7 @@ import contextlib
 import time
 
 from bikeped import __version__
-from bikeped.config import LoadedConfig, road_strip
+from bikeped.config import LoadedConfig, road_region
 from bikeped.detection.base import load_detector
 from bikeped.errors import DetectorError
 from bikeped.service.vision import Eye, ModelEye
@@ -21,7 +21,7 @@ def load_eye(loaded: LoadedConfig) -> Eye:
             f"{loaded.source}: detection.model: no model is configured; name an .onnx or .engine "
             "file there, or with --set detection.model=FILE"
         )
-    return ModelEye(load_detector(loaded.config.detection, loaded.base_dir, road_strip(loaded)))
+    return ModelEye(load_detector(loaded.config.detection, loaded.base_dir, road_region(loaded)))
 
 
 def header_of(loaded: LoadedConfig, eye: Eye) -> EventHeader:

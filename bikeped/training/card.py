@@ -21,10 +21,10 @@ from bikeped.capture.jpeg import JpegDecoder
 from bikeped.config import LoadedConfig
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import Detector, load_detector
-from bikeped.geometry import road_strip
+from bikeped.geometry import road_region
 from bikeped.scene import Conditions, DrawnObject, SceneCamera, pictures, scene_camera
 from bikeped.scene.clip import encode_jpeg
-from bikeped.types import Detections, FloatArray, Kind, Strip
+from bikeped.types import Detections, FloatArray, Kind, Region
 
 #: Bounds of the distance rings, metres along the ground from below the lens.
 RINGS_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0)
@@ -75,15 +75,15 @@ def drawn_test(
 
     `model.model` is an absolute path.
     """
-    detectors: dict[Strip, Detector] = {}
+    detectors: dict[Region, Detector] = {}
     range_m = loaded.config.decision.max_range_m
     seen, lights = [], []
     for jpeg, objects, view, conditions in _drawn(loaded, test):
         # Each camera's road, as the service has it of its own camera.
-        strip = road_strip(view.camera, view.framing, range_m)
-        if strip not in detectors:
-            detectors[strip] = load_detector(model, Path("/"), strip)
-        found = _look(detectors[strip], jpeg, view)
+        region = road_region(view.camera, view.framing, range_m)
+        if region not in detectors:
+            detectors[region] = load_detector(model, Path("/"), region)
+        found = _look(detectors[region], jpeg, view)
         seen.append(judge_picture(found, objects, view))
         lights.append("rain" if conditions.weather == "rain" else conditions.light)
         progress(len(seen))

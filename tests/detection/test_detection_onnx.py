@@ -15,7 +15,7 @@ from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.onnx_runtime import _options, choose_providers
 from bikeped.errors import DetectorError
-from bikeped.types import Kind, Strip
+from bikeped.types import Kind, Region
 
 SIZE = (96, 64)
 CELLS = 12 * 8 + 6 * 4 + 3 * 2
@@ -126,25 +126,25 @@ def test_input_types_and_dynamic_shapes(tmp_path, dtype):
 
 
 #: The lower half of FRAME, 320 of 640 rows, is 32 rows of an input 96 wide; grey beside it.
-ROAD = Strip(0.5, 1.0, 960 / 640)
+ROAD = Region(0.0, 0.5, 1.0, 1.0, 960 / 640)
 
 
 def test_of_an_input_of_any_height_only_the_road_is_asked_for(tmp_path):
     free = (1, 3, "height", "width")
     full = save(tmp_path / "full.onnx", answer_of("yolov8"), ULTRALYTICS, free)
-    # 32 rows of road and 16 of grey, rounded up to 64: as high as the whole frame.
+    # 32 rows of road and 12 of grey, rounded up to 64: as high as the whole frame.
     found = load(full, ROAD).infer(grey(), *FRAME).detections
-    # The person's middle, row 30 of the input: 14 rows below the strip's first, ten times that.
+    # The person's middle, row 30 of the input: 14 rows below the road's first, ten times that.
     np.testing.assert_allclose(found.box_px, [[300, 410, 500, 510]], atol=0.01)
     short = np.zeros((1, 7, 96), np.float32)
-    narrow = Strip(0.75, 1.0, 960 / 640)
+    narrow = Region(0.0, 0.75, 1.0, 1.0, 960 / 640)
     short[0, :5, 17] = 40.0, 16.0, 20.0, 10.0, 0.9
     answer = np.ascontiguousarray(short[:, :, : 12 * 4 + 6 * 2 + 3])
     path = save(tmp_path / "short.onnx", answer, ULTRALYTICS, free)
     detector = load(path, narrow)
     assert detector.input_size == (96, 32)
     assert detector.decode_size(*FRAME) == (96, 64)
-    # 16 of the 32 rows show the strip's 160, centred: row 16 is the strip's middle.
+    # 16 of the 32 rows show the road's 160, centred: row 16 is its middle.
     for scale in (1, 2, 10):
         found = detector.infer(grey(scale=scale), *FRAME).detections
         np.testing.assert_allclose(found.box_px, [[300, 510, 500, 610]], atol=0.01)
@@ -152,7 +152,7 @@ def test_of_an_input_of_any_height_only_the_road_is_asked_for(tmp_path):
 
 def test_what_lies_beside_the_strip_is_nothing(tmp_path):
     answer = answer_of("yolov8")
-    answer[0, 1, 17] = 5.0  # in the grey above the strip
+    answer[0, 1, 17] = 5.0  # in the grey above the region
     path = save(tmp_path / "m.onnx", answer, ULTRALYTICS, (1, 3, "height", "width"))
     assert len(load(path, ROAD).infer(grey(), *FRAME).detections) == 0
     assert len(load(path, ROAD, region="frame").infer(grey(), *FRAME).detections) == 1
@@ -164,7 +164,7 @@ def test_a_model_of_one_size_is_shown_the_road_only_where_asked(tmp_path, region
     with caplog.at_level(logging.INFO):
         detector = load(path, ROAD, region=region)
     assert detector.input_size == SIZE
-    assert ("rows from 50.0% to 100.0%" in caplog.text) == (rows > 0)
+    assert ("from 50.0% to 100.0% down" in caplog.text) == (rows > 0)
     y = detector.infer(grey(), *FRAME).detections.box_px[0, 1]
     assert y == pytest.approx(410 if rows else 250, abs=0.01)
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.detection.preprocess import FAMILIES, Letterbox, Preprocessor
-from bikeped.types import Strip
+from bikeped.types import Region
 
 MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
@@ -141,53 +141,47 @@ def test_bad_buffers_and_sizes_are_refused():
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_of_a_strip_the_network_sees_just_its_rows(family):
+def test_of_a_region_the_network_sees_just_that(family):
     rgb = picture(96, 64)
-    shown = Preprocessor(family, np.zeros((1, 3, 64, 64), np.float32), Strip(0.5, 1.0, 64 / 96))
+    half = Region(0.25, 0.5, 0.75, 1.0, 64 / 96)
+    shown = Preprocessor(family, np.zeros((1, 3, 64, 64), np.float32), half)
     where = shown(rgb, 64, 96)
     cut = Preprocessor(family, np.zeros((1, 3, 64, 64), np.float32))
-    cut(rgb[48:], 64, 48)
+    cut(np.ascontiguousarray(rgb[48:, 16:48]), 32, 48)
     np.testing.assert_array_equal(shown.buffer, cut.buffer)
-    assert where.shown_px == (0, 48, 64, 96)
-    box = np.array([[10.0, 60.0, 20.0, 90.0]])
-    np.testing.assert_allclose(where.inverse(where.forward(box)), box)
+    assert where.shown_px == (16, 48, 48, 96)
+    box = np.array([[20.0, 60.0, 30.0, 90.0]])
+    np.testing.assert_allclose(where.inverse(where.forward(box)), box, atol=1e-5)
 
 
-def test_a_strip_of_a_smaller_copy_lies_in_the_same_place():
+def test_the_region_of_a_smaller_copy_lies_in_the_same_place():
     full = np.zeros((400, 800, 3), np.uint8)
     full[200:, 400:] = 200
-    run = Preprocessor("ultralytics", np.zeros((1, 3, 64, 128), np.float32), Strip(0.4, 1.0, 2.0))
+    part = Region(0.25, 0.4, 1.0, 1.0, 2.0)
+    run = Preprocessor("ultralytics", np.zeros((1, 3, 64, 128), np.float32), part)
     where = run(full, 800, 400)
     first = run.buffer.copy()
-    half = run(np.ascontiguousarray(full[::2, ::2]), 800, 400)
-    assert (half.left, half.top, half.width, half.height) == (
-        where.left,
-        where.top,
-        where.width,
-        where.height,
-    )
+    assert run(np.ascontiguousarray(full[::2, ::2]), 800, 400) == where
     assert np.abs(run.buffer - first).mean() < 0.01
-    # 400 rows in thirds: a copy's rows are whole ones, and boxes land by them.
+    # Thirds of 800 x 400: whole pixels of the copy are cut, and boxes land by them.
     third = run(picture(133, 267), 800, 400)
-    assert third.first_row == pytest.approx(53 * 400 / 133)
-    np.testing.assert_allclose(
-        third.inverse(third.forward(np.array([[0, 200, 800, 400]]))),
-        [[0, 200, 800, 400]],
-        atol=1e-3,
-    )
+    assert third.shown_px == pytest.approx((67 * 800 / 267, 53 * 400 / 133, 800, 400))
+    box = np.array([[300, 200, 800, 400]])
+    np.testing.assert_allclose(third.inverse(third.forward(box)), box, atol=1e-3)
 
 
 @given(
     st.sampled_from(FAMILIES),
     st.tuples(st.integers(64, 4000), st.integers(64, 4000)),
     st.tuples(st.integers(32, 1280), st.integers(32, 1280)),
-    st.floats(0, 0.8),
+    st.tuples(st.floats(0, 0.45), st.floats(0, 0.8), st.floats(0.55, 1)),
     st.lists(st.floats(0, 1), min_size=4, max_size=4),
 )
-def test_boxes_of_a_strip_come_back(family, frame, size, top, share):
-    first, last = top * frame[1], float(frame[1])
-    where = Letterbox.fit(*frame, size, family, (first, last))
-    low, high = np.array([0, first] * 2), np.array([frame[0], last] * 2)
+def test_boxes_of_a_region_come_back(family, frame, size, part, share):
+    left, top, right = part
+    shown = left * frame[0], top * frame[1], right * frame[0], float(frame[1])
+    where = Letterbox.fit(*frame, size, family, shown)
+    low, high = np.array(shown[:2] * 2), np.array(shown[2:] * 2)
     box = low + np.array([share]) * (high - low)
     inside = where.forward(box)
     assert (inside >= -1e-2).all()
