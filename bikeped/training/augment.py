@@ -24,7 +24,14 @@ import numpy.typing as npt
 from bikeped import __version__
 from bikeped.conformance.workers import workers
 from bikeped.errors import DataSetError
-from bikeped.training.coco import CocoData, CocoImage, CocoObject, read_picture, write_annotations
+from bikeped.training.coco import (
+    CocoData,
+    CocoImage,
+    CocoObject,
+    furniture,
+    read_picture,
+    write_annotations,
+)
 from bikeped.training.warp import Warp, WarpRanges, sample_warp, warp_boxes, warp_picture
 from bikeped.types import BoolArray, FloatArray, ImageArray
 
@@ -206,25 +213,38 @@ def _copies(
 ) -> _Made:
     """Draws all copies of one picture; their entries, annotations, and how many were dropped."""
     picture = read_picture(image)
+    standing = furniture(image)
     entries: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     lost = 0
     for copy in range(settings.copies):
         warp = sample_warp(picture_generator(settings.seed, image.id, copy), settings.ranges)
-        drawn, boxes, kept = augment_picture(
+        drawn, every_box, every_kept = augment_picture(
             picture,
-            [thing.box_px for thing in objects],
+            [*(thing.box_px for thing in objects), *(box for _, box in standing)],
             warp,
-            polygons=[thing.polygons for thing in objects],
-            crowd=[thing.crowd for thing in objects],
+            polygons=[*(thing.polygons for thing in objects), *(() for _ in standing)],
+            crowd=[*(thing.crowd for thing in objects), *(False for _ in standing)],
             least_share=settings.least_share,
         )
+        boxes, kept = every_box[: len(objects)], every_kept[: len(objects)]
         name = f"{image.id:012d}_{copy}.jpg"
         _write_jpeg(folder / name, drawn)
         new_id = image.id * settings.copies + copy
+        things = [
+            {"what": what, "bbox": _bbox(box)}
+            for (what, _), box, keep in zip(
+                standing,
+                every_box[len(objects) :].tolist(),
+                every_kept[len(objects) :].tolist(),
+                strict=True,
+            )
+            if keep
+        ]
         entries.append(
             {
                 **image.entry,
+                **({"furniture": things} if "furniture" in image.entry else {}),
                 "id": new_id,
                 "file_name": f"images/{name}",
                 "width": warp.size_px,
@@ -244,17 +264,22 @@ def _copies(
 def _annotation(
     thing: CocoObject, box: Sequence[float], image_id: int, copy: int, copies: int
 ) -> dict[str, Any]:
-    # Three decimals: far below what anyone can mark, and no rounding noise in the file.
-    x1, y1, x2, y2 = (round(value, 3) for value in box)
-    wide, high = round(x2 - x1, 3), round(y2 - y1, 3)
+    x, y, wide, high = _bbox(box)
     return {
         "id": thing.id * copies + copy,
         "image_id": image_id,
         "category_id": thing.category_id,
-        "bbox": [x1, y1, wide, high],
+        "bbox": [x, y, wide, high],
         "area": round(wide * high, 3),
         "iscrowd": int(thing.crowd),
     }
+
+
+def _bbox(box: Sequence[float]) -> list[float]:
+    """COCO's x, y, width, height of x1, y1, x2, y2."""
+    # Three decimals: far below what anyone can mark, and no rounding noise in the file.
+    x1, y1, x2, y2 = (round(value, 3) for value in box)
+    return [x1, y1, round(x2 - x1, 3), round(y2 - y1, 3)]
 
 
 def _header(data: CocoData, settings: AugmentSettings) -> dict[str, Any]:

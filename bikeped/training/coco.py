@@ -27,6 +27,7 @@ from bikeped.types import FloatArray, ImageArray
 
 _JPEG = b"\xff\xd8"
 _LARGEST_SIDE = 32768
+Box = tuple[float, float, float, float]  #: x1, y1, x2, y2 in pixels of a picture
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,28 @@ def read_coco(data: Path, images_dir: Path | None = None) -> CocoData:
         empty=empty,
         sha256=hashlib.sha256(content).hexdigest(),
     )
+
+
+def furniture(image: CocoImage) -> list[tuple[str, Box]]:
+    """What stands in a drawn picture and is nobody, and its box within the picture.
+
+    bikeped's own addition to an image's entry (`bikeped.scene`): `furniture`, a list of `what` and
+    `bbox`, which may reach beyond the picture. Raises DataSetError where it is no such list.
+    """
+    found: list[tuple[str, Box]] = []
+    try:
+        for thing in image.entry.get("furniture", ()):
+            x, y, wide, high = (float(side) for side in thing["bbox"])
+            x1, y1 = max(x, 0.0), max(y, 0.0)
+            x2, y2 = min(x + wide, float(image.width)), min(y + high, float(image.height))
+            if x2 - x1 >= 1 and y2 - y1 >= 1:
+                found.append((str(thing["what"]), (x1, y1, x2, y2)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataSetError(
+            f"{image.path}: its `furniture` (image {image.id}) is no list of what and bbox; "
+            "correct or remove it"
+        ) from error
+    return found
 
 
 def read_picture(image: CocoImage) -> ImageArray:

@@ -17,7 +17,7 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.preprocess import PAD, Letterbox
 from bikeped.errors import CaptureError, DataSetError
-from bikeped.training.coco import CocoData, CocoImage, read_picture
+from bikeped.training.coco import Box, CocoData, CocoImage, furniture, read_picture
 from bikeped.types import FloatArray, ImageArray, IntArray
 
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
@@ -87,20 +87,10 @@ def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
 
 
 def _furniture(image: CocoImage, fit: Letterbox) -> dict[str, FloatArray]:
-    """The part within the picture of every thing in the entry's `furniture`, in view pixels."""
-    found: dict[str, list[FloatArray]] = {}
-    edge = np.array([image.width, image.height] * 2, np.float64)
-    try:
-        for thing in image.entry.get("furniture", ()):
-            x, y, wide, high = (float(side) for side in thing["bbox"])
-            box = np.clip([x, y, x + wide, y + high], 0.0, edge)
-            if box[2] - box[0] >= 1 and box[3] - box[1] >= 1:
-                found.setdefault(str(thing["what"]), []).append(box)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataSetError(
-            f"{image.path}: its `furniture` (image {image.id}) is no list of what and bbox; "
-            "correct or remove it"
-        ) from error
+    """The boxes of every kind of thing in view pixels."""
+    found: dict[str, list[Box]] = {}
+    for what, box in furniture(image):
+        found.setdefault(what, []).append(box)
     return {what: fit.forward(np.array(boxes)).astype(np.float64) for what, boxes in found.items()}
 
 

@@ -361,3 +361,24 @@ def test_no_folder_that_holds_something_is_written_into(tmp_path):
     (tmp_path / "empty").mkdir()
     augment_data(data, tmp_path / "empty", AugmentSettings(SMALL))
     assert len(read_coco(tmp_path / "empty").images) == 3
+
+
+def test_furniture_is_bent_as_people_are(tmp_path):
+    box = [150.0, 100.0, 30.0, 60.0]
+    file = write_set(tmp_path / "set", [annotation(7, 1, 2, box)])
+    entry = read_coco(file).images[0].entry
+    lost = [5000.0, 20.0, 30.0, 40.0]  # beside the picture
+    edit(file, images=[{**entry, "furniture": [
+        {"what": "sign", "bbox": box}, {"what": "tree", "bbox": lost}
+    ]}])  # fmt: skip
+    out = tmp_path / "new"
+    augment_data(read_coco(file), out, AugmentSettings(SMALL, copies=3, processes=1))
+    made = json.loads((out / "annotations.json").read_text())
+    boxes = {note["image_id"]: note["bbox"] for note in made["annotations"]}
+    assert boxes
+    for image in made["images"]:
+        things = image["furniture"]
+        assert [thing["bbox"] for thing in things] == [
+            boxes[i] for i in [image["id"]] if i in boxes
+        ]
+        assert all(thing["what"] == "sign" for thing in things)
