@@ -46,12 +46,12 @@ def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> C
         return "its corners make no regular board"
     uv = arranged(grey, pattern, mended[0])
     near = local_map(seen, seen, uv)
-    uv = _settled(grey, near, uv)
+    uv = settled(grey, near, uv)
     refined = refine(grey, seen, uv)
-    good, expected = _good(grey, seen, refined)
+    good, expected = good_corners(grey, seen, refined)
     if not good.all() and good.mean() > 0.5:
         again = refine(grey, seen, np.where(good[:, None], refined.uv_px, expected))
-        better, _ = _good(grey, seen, again)
+        better, _ = good_corners(grey, seen, again)
         if better.sum() > good.sum():
             refined, good = again, better
     if good.mean() < _KEPT:
@@ -110,8 +110,9 @@ def _dark_start(grey: ImageArray, pattern: BoardPattern, grid: FloatArray) -> bo
     return bool(level[even].mean() < level[~even].mean())
 
 
-def _settled(grey: ImageArray, near: LocalMap, uv: FloatArray) -> FloatArray:
-    """Within half a pixel or so, by the gradient method with a window of each corner's own size."""
+def settled(grey: ImageArray, near: LocalMap, uv: FloatArray) -> FloatArray:
+    """[n, 2] within half a pixel or so, by the gradient method with a window of each corner's own
+    size; `uv` [n, 2] where the detector's guess is better."""
     height, width = grey.shape
     half = np.clip(np.rint(0.2 * near.spacing_px.min(1)), 2, 12).astype(int)
     inside = (uv > 1).all(1) & (uv[:, 0] < width - 2) & (uv[:, 1] < height - 2)
@@ -127,8 +128,11 @@ def _settled(grey: ImageArray, near: LocalMap, uv: FloatArray) -> FloatArray:
     return out
 
 
-def _good(grey: ImageArray, seen: FloatArray, refined: Refined) -> tuple[BoolArray, FloatArray]:
-    """Which corners are crossings of the right colours where their neighbours expect them."""
+def good_corners(
+    grey: ImageArray, seen: FloatArray, refined: Refined
+) -> tuple[BoolArray, FloatArray]:
+    """[n] which corners are crossings of the right colours where their neighbours expect them, and
+    [n, 2] where that is. `seen` [n, 2] column and row of each."""
     near = local_map(seen, seen, refined.uv_px)
     spacing = near.spacing_px.min(1)
     colour = crossing(grey, near) * np.where(seen.sum(1) % 2 == 0, 1.0, -1.0)

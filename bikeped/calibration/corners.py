@@ -1,6 +1,7 @@
 """Boards in pictures: detectors in order of cost, each board checked and refined, or refused.
 
-`find_boards` is the way in. A picture stops at the first detector whose board holds.
+`find_boards` is the way in. A picture stops at the first detector whose board holds; where none
+finds a whole board, a part of one is looked for (`partial.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from bikeped.calibration.check import Checked, check_board
 from bikeped.calibration.detect_raw import quick_candidates, raw_candidates
 from bikeped.calibration.detect_remapped import remapped_candidates
+from bikeped.calibration.partial import partial_board
 from bikeped.calibration.pictures import Picture, check_sizes, load_pictures, pictures_hash
 from bikeped.calibration.views import BoardPattern, BoardView, Found, Refused
 from bikeped.errors import CalibrationError
@@ -82,13 +84,19 @@ def check_pattern(pattern: BoardPattern) -> None:
 
 
 def find_board(grey: ImageArray, pattern: BoardPattern, *, thorough: bool = True) -> _Seen:
-    """One picture's board. Not `thorough`: only the quickest detector, for live frames."""
+    """One picture's board. Not `thorough`: only the quickest detector, for live frames, and only
+    whole boards."""
     why = ""
     for candidate in _candidates(grey, pattern, thorough):
         checked = check_board(grey, pattern, candidate)
         if isinstance(checked, Checked):
             return _Seen(checked, "")
         why = why or checked
+    if thorough:
+        part = partial_board(grey, pattern)
+        if isinstance(part, Checked):
+            return _Seen(part, "")
+        why = part or why
     wanted = f"{pattern.columns}x{pattern.rows}"
     return _Seen(None, f"no whole {wanted} board found" + (f": {why}" if why else ""))
 
@@ -149,7 +157,7 @@ def _before(
 ) -> str:
     for other, view in zip(kept, views, strict=True):
         _, mine, theirs = np.intersect1d(board.ids, view.ids, return_indices=True)
-        if len(mine) < 0.8 * len(board.ids):
+        if len(mine) < 0.8 * min(len(board.ids), len(view.ids)):
             continue
         moved = np.linalg.norm(board.uv_px[mine] - view.uv_px[theirs], axis=1)
         far = float(np.sqrt(np.mean(moved**2)))
