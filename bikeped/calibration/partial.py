@@ -81,7 +81,7 @@ def placed(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> Checked | str
         return ids
     least = int(np.ceil(LEAST_SHARE * pattern.count))
     if len(ids) < least:
-        return f"only {len(ids)} of {pattern.count} corners can be seen clearly; show {least}"
+        return f"only {len(ids)} of {pattern.count} corners can be seen clearly, not {least}"
     spacing = local_map(seen, seen, uv).spacing_px.min(1)
     order = np.argsort(ids)
     blur = float(np.median(refined.blur_px[good]))

@@ -1,8 +1,8 @@
 """Which corners of the board a grid holds: told by its extent, or by the board's own outer edge.
 
-A grid with all columns has only one place along the rows. With fewer, an edge of the board still
-says where it lies: there the outermost squares are followed by the paper's white margin. A wrong
-number is worse than none, so all else is refused, with the reason.
+A grid with all columns and all rows has only one place on the board. With one line too few, an
+edge of the board still says which one is missing: there the outermost squares are followed by the
+paper's white margin. A wrong number is worse than none, so all else is refused, with the reason.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PINNED_AT = (
 )
 _PINNED_SHARE = 0.75  # ... this share
 _GOES_ON_AT = 2  # places beyond a line that are crossings, too
-_CLEARLY = 0.25  # of the contrast, from the middle: light or dark
+_CLEARLY = 0.5  # of the way from the middle to what light and dark squares are
 _STEP, _TIGHT = 0.3, 0.18  # squares to either side of an outer edge, where it is looked at
 
 
@@ -37,32 +37,29 @@ def pin(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> IntArray | str:
     whole = _Extent.of(grid, 1)
     if not _within(whole.size, pattern):
         return _more(pattern, whole.size)
+    wanted = np.array([pattern.columns, pattern.rows])
     ways: list[_Way] = []
     reasons: list[str] = []
     for turns in range(4):
         turned = _turned(grid, turns)
         extent = _Extent.of(turned, LEAST_IN_LINE)
-        if (extent.size > [pattern.columns, pattern.rows]).any() or (extent.size < 1).any():
+        if (extent.size > wanted).any() or (extent.size < 1).any():
             continue
         first = _first(grey, pattern, turned, extent)
         if isinstance(first, str):
             reasons.append(first)
             continue
         at = turned.cell - first
-        if (at < 0).any() or (at >= [pattern.columns, pattern.rows]).any():
-            reasons.append("crossings beyond its outer edge contradict its place")
+        if (at < 0).any() or (at >= wanted).any():
+            reasons.append("some of its corners lie beyond its white margin: something hides it")
             continue
-        dark = ((first.sum() % 2) == 0) == turned.dark
-        short = bool((extent.size < [pattern.columns, pattern.rows]).any())
-        ways.append(_Way(turns, at, dark, short))
-    square = pattern.columns == pattern.rows
+        dark = bool(first.sum() % 2 == 0) == turned.dark
+        ways.append(_Way(at, dark, bool((extent.size < wanted).any())))
     if not ways:
-        return max(reasons, key=len, default=_more(pattern, whole.size))
-    if not square and len({way.turns % 2 for way in ways}) > 1:
-        return _short(pattern, whole.size)
+        return reasons[0] if reasons else _short(pattern, whole.size)
     allowed = [way for way in ways if way.dark]
     if not allowed and any(way.short for way in ways):
-        # An edge taken for the board's own would shift it by a square, which turns the colours.
+        # An edge that is taken for the board's own shifts all by a line, which turns the colours.
         return _short(pattern, whole.size)
     best = max(allowed or ways, key=lambda way: _upright(grid, way.at))
     return np.asarray(best.at[:, 1] * pattern.columns + best.at[:, 0], np.int64)
@@ -70,9 +67,8 @@ def pin(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> IntArray | str:
 
 @dataclass(frozen=True)
 class _Way:
-    """One numbering: quarter turns, place on the board [n, 2], and how sure it is."""
+    """One numbering: places on the board [n, 2], and what speaks for it."""
 
-    turns: int
     at: IntArray
     dark: bool  #: whether the outer square beyond corner 0 is
     short: bool  #: placed by an outer edge, not by its extent
@@ -121,24 +117,30 @@ def _first(grey: ImageArray, pattern: BoardPattern, grid: Grid, extent: _Extent)
     """[2] the cell that is the board's corner 0; or why that is not known."""
     out = extent.low.copy()
     wanted = np.array([pattern.columns, pattern.rows])
+    missing = wanted - extent.size
+    if missing.sum() > 1 or (missing.any() and _fits_turned(extent.size, wanted)):
+        return _short(pattern, extent.size)
     for axis in (0, 1):
         ends = [_End.of(grey, grid, extent, axis, way) for way in (-1, 1)]
-        if extent.size[axis] == wanted[axis]:
-            if any(end.goes_on >= _GOES_ON_AT for end in ends):
-                return _more(pattern, extent.size)
-            if all(end.ends < _ENDS_AT for end in ends):
-                what = ("columns", "rows")[axis]
-                return (
-                    f"{wanted[axis]} {what} are in sight, but no white margin on either side of "
-                    "them: there may be more; show an outer edge of the board"
-                )
-            continue
-        before, after = (end.pins for end in ends)
-        if before == after:
-            return _short(pattern, extent.size)
-        if after:
-            out[axis] = extent.high[axis] + 1 - wanted[axis]
+        if missing[axis]:
+            before, after = (end.pins for end in ends)
+            if before == after:
+                return _short(pattern, extent.size)
+            out[axis] -= int(after)
+        elif any(end.goes_on >= _GOES_ON_AT for end in ends):
+            return _more(pattern, extent.size)
+        elif all(end.ends < _ENDS_AT for end in ends):
+            what = ("columns", "rows")[axis]
+            return (
+                f"{wanted[axis]} {what} are in sight, but no white margin on either side of them: "
+                "there may be more; show an outer edge of the board"
+            )
     return out
+
+
+def _fits_turned(size: IntArray, wanted: IntArray) -> bool:
+    """Whether a grid fits with columns for rows, too, where that is another place."""
+    return wanted[0] != wanted[1] and bool((size[::-1] <= wanted).all())
 
 
 @dataclass(frozen=True)
@@ -168,25 +170,30 @@ class _End:
         outward[axis] = way
         beyond = last + outward
         near = grid.near(beyond)
-        low, high = _levels(grey, grid, last)
-        middle, clear = (low + high) / 2, _CLEARLY * (high - low)
+        dark, light = _levels(grey, grid, last)
         seen, white = np.ones(len(last), np.bool_), np.ones(len(last), np.bool_)
         for share in (_TIGHT, _STEP):
             inner, outer = (_steps(axis, side * way, share) for side in (-1, 1))
-            level = (sample(grey, near.at_steps(inner)) - middle[:, None]) * grid.lights(
-                beyond, inner
+            here, there = (
+                _shade(sample(grey, near.at_steps(step)), dark, light) for step in (inner, outer)
             )
-            seen &= (level > clear[:, None]).all(1)
-            level = sample(grey, near.at_steps(outer)) - middle[:, None]
-            white &= (level > clear[:, None]).all(1)
-            crosses = (level * grid.lights(beyond, outer) > clear[:, None]).all(1)
-            ends = (level > 0).all(1)
+            seen &= (here * grid.lights(beyond, inner) > _CLEARLY).all(1)
+            # As light as the board's own squares: the same paper, not a sheet or a glare over it.
+            white &= (np.abs(there - 1) < 1 - _CLEARLY).all(1)
+            crosses = (there * grid.lights(beyond, outer) > _CLEARLY).all(1)
+            ends = (there > 0).all(1)
         return _End(
             int(seen.sum()),
             int((seen & crosses).sum()),
             int((seen & ends).sum()),
             int((seen & white).sum()),
         )
+
+
+def _shade(level: FloatArray, dark: FloatArray, light: FloatArray) -> FloatArray:
+    """Grey levels [n, k] on a scale from -1 as the dark squares [n] to 1 as the light ones."""
+    half = np.maximum(light - dark, 1.0)[:, None] / 2
+    return np.asarray((level - (light + dark)[:, None] / 2) / half)
 
 
 def _steps(axis: int, way: int, share: float) -> FloatArray:
