@@ -22,7 +22,7 @@ _CLEAN = 0.3  # `crossing` of a corner that is one
 _OFF = 0.2  # squares from where the neighbours expect a corner
 _SNAP = 0.25  # the same for a new one, which they can only continue to
 _PARALLEL = np.cos(np.radians(25.0))  # its edges and theirs
-_NEAR = 2  # columns and rows to either side that tell where a new corner must lie ...
+_NEAR = 3  # columns and rows to either side that tell where a new corner must lie ...
 _TOLD_BY = 5  # ... by at least so many corners
 _ROUNDS = 40
 _STEPS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -108,14 +108,14 @@ def _components(points: Saddles, link: IntArray) -> Iterator[_Growing]:
     found = []
     for seed in sorted(left, key=lambda n: (-int((link[n] >= 0).sum()), n)):
         if seed in left:
-            part = _component(points, link, seed)
+            part = _component(points, link, seed, left)
             left -= set(part.point.tolist())
             found.append(part)
     found = [part for part in found if len(part.cell) >= _FEWEST]
     yield from sorted(found, key=lambda part: -len(part.cell))
 
 
-def _component(points: Saddles, link: IntArray, seed: int) -> _Growing:
+def _component(points: Saddles, link: IntArray, seed: int, free: set[int]) -> _Growing:
     """Numbers a saddle's neighbours, theirs, and so on; the first number that one gets stays."""
     cells = {(0, 0): seed}
     right_of = {seed: (0, 0)}  # each saddle's edge to the right: type, and 1 against the edge
@@ -136,7 +136,7 @@ def _component(points: Saddles, link: IntArray, seed: int) -> _Growing:
             way = (against if along_row else down_against) ^ int(step.sum() < 0)
             other = int(link[one, way_kind, way])
             place = (at[one][0] + int(step[0]), at[one][1] + int(step[1]))
-            if other < 0 or other in at or place in cells:
+            if other not in free or other in at or place in cells:
                 continue
             cells[place], at[other] = other, place
             # Types alternate; its right points as this one's does.

@@ -18,7 +18,7 @@ from bikeped.calibration.grow import Grid, grids
 from bikeped.calibration.pin import pin
 from bikeped.calibration.refine import refine
 from bikeped.calibration.views import BoardPattern
-from bikeped.types import BoolArray, FloatArray, ImageArray
+from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
 
 _SCALES = (1.0, 2.0, 0.5)  # of a picture made FIRST_SIDE_PX large; no more than _LARGEST_PX
 _LARGEST_PX = 2300
@@ -26,7 +26,8 @@ _LARGEST_PX = 2300
 LEAST_SHARE = 0.5
 _BOARD_SHARE = 1 / 3  # of the corners: in sight, and worth a word on what is missing
 _STRANGE_TIMES, _STRANGE = 3.0, 0.1  # what a refined corner may leave: times the usual, at least
-_BESIDE_TIMES, _BESIDE = 1.5, 0.015  # the same beside a hidden one
+_BESIDE_TIMES, _BESIDE = 1.7, 0.015  # the same beside a hidden one
+_USUAL = 0.25  # quantile: more than half of the corners may be disturbed
 _PASSES = 3
 
 
@@ -66,11 +67,12 @@ def placed(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> Checked | str
         return ""
     seen = grid.cell.astype(np.float64)
     uv = settled(grey, grid.near(grid.cell), grid.uv_px)
+    beside = _beside_hidden(grid.cell)
     for _ in range(_PASSES):
         refined = refine(grey, seen, uv)
         good, _ = good_corners(grey, seen, refined)
-        good &= _undisturbed(seen, refined.residual)
-        seen, uv = seen[good], refined.uv_px[good]
+        good &= _undisturbed(refined.residual, beside)
+        seen, uv, beside = seen[good], refined.uv_px[good], beside[good]
         if good.all() or len(seen) < _BOARD_SHARE * pattern.count:
             break
     if len(seen) < _BOARD_SHARE * pattern.count:
@@ -88,23 +90,27 @@ def placed(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> Checked | str
     return Checked(ids[order], uv[order], blur, float(np.median(spacing)))
 
 
-def _undisturbed(seen: FloatArray, residual: FloatArray) -> BoolArray:
+def _beside_hidden(cell: IntArray) -> BoolArray:
+    """[n] which of a grid's cells [n, 2] have a neighbour missing within its outer lines."""
+    low, high = cell.min(0) - 1, cell.max(0) + 1
+    place = cell - low
+    held: BoolArray = np.ones(high - low + 1, np.bool_)
+    held[1:-1, 1:-1] = False
+    held[place[:, 0], place[:, 1]] = True
+    beside = np.zeros(len(cell), np.bool_)
+    for column in (-1, 0, 1):
+        for row in (-1, 0, 1):
+            beside |= ~held[place[:, 0] + column, place[:, 1] + row]
+    return beside
+
+
+def _undisturbed(residual: FloatArray, beside: BoolArray) -> BoolArray:
     """[n] which corners the edge of what hides the others does not touch.
 
     Where it runs along an edge of the board it moves a corner by half a pixel and leaves little
     that the model cannot explain: a corner with a hidden neighbour has to fit as the usual ones do.
     """
-    usual = float(np.median(residual))
-    low, high = seen.min(0) - 1, seen.max(0) + 1
-    place = (seen - low).astype(np.intp)
-    # Beyond the outer lines nothing is missing.
-    held: BoolArray = np.ones((high - low + 1).astype(np.intp), np.bool_)
-    held[1:-1, 1:-1] = False
-    held[place[:, 0], place[:, 1]] = True
-    beside = np.zeros(len(seen), np.bool_)
-    for column in (-1, 0, 1):
-        for row in (-1, 0, 1):
-            beside |= ~held[place[:, 0] + column, place[:, 1] + row]
+    usual = float(np.quantile(residual, _USUAL))
     most = np.where(
         beside, max(_BESIDE_TIMES * usual, _BESIDE), max(_STRANGE_TIMES * usual, _STRANGE)
     )

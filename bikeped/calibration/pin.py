@@ -54,13 +54,14 @@ def pin(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> IntArray | str:
             reasons.append("some of its corners lie beyond its white margin: something hides it")
             continue
         dark = bool(first.sum() % 2 == 0) == turned.dark
-        ways.append(_Way(at, dark, bool((extent.size < wanted).any())))
+        ways.append(_Way(at, dark, extent.size))
     if not ways:
-        return reasons[0] if reasons else _short(pattern, whole.size)
+        few = f"fewer than {LEAST_IN_LINE} corners of its outer rows and columns can be seen"
+        return reasons[0] if reasons else few
     allowed = [way for way in ways if way.dark]
-    if not allowed and any(way.short for way in ways):
+    if not allowed and (ways[0].size < wanted).any():
         # An edge that is taken for the board's own shifts all by a line, which turns the colours.
-        return _short(pattern, whole.size)
+        return _short(pattern, ways[0].size)
     best = max(allowed or ways, key=lambda way: _upright(grid, way.at))
     return np.asarray(best.at[:, 1] * pattern.columns + best.at[:, 0], np.int64)
 
@@ -71,7 +72,7 @@ class _Way:
 
     at: IntArray
     dark: bool  #: whether the outer square beyond corner 0 is
-    short: bool  #: placed by an outer edge, not by its extent
+    size: IntArray  #: columns and rows in sight: with fewer than all, an outer edge placed it
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ def _first(grey: ImageArray, pattern: BoardPattern, grid: Grid, extent: _Extent)
                 return _short(pattern, extent.size)
             out[axis] -= int(after)
         elif any(end.goes_on >= _GOES_ON_AT for end in ends):
-            return _more(pattern, extent.size)
+            return _more(pattern, extent.size + (np.arange(2) == axis))
         elif all(end.ends < _ENDS_AT for end in ends):
             what = ("columns", "rows")[axis]
             return (
@@ -231,7 +232,8 @@ def _short(pattern: BoardPattern, size: IntArray) -> str:
     ]
     return (
         f"{' and '.join(parts)} of the {pattern.columns}x{pattern.rows} board are in sight: which "
-        "ones cannot be known; show the whole width and height, some corners may be hidden"
+        f"ones cannot be known; show the whole width and height ({LEAST_IN_LINE} corners of each "
+        "outer row and column at least), others may be hidden"
     )
 
 

@@ -81,7 +81,8 @@ def _card(
         f'<g stroke="#ff5a36" stroke-width="{1.8 / zoom:.2f}">{lines}</g>'
         f'<g fill="#ffe14a">{dots}</g></svg>'
         f"<figcaption><b>{name}</b><br>RMS {rms:.2f} px{held_text}, worst corner {worst:.2f} px; "
-        f"{theta.min():.0f} to {theta.max():.0f}° from the axis, {len(uv)} corners"
+        f"{theta.min():.0f} to {theta.max():.0f}° from the axis, "
+        f"{len(uv)} of {fit.sightings.pattern.count} corners"
         "</figcaption></figure>"
     )
 

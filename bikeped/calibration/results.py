@@ -28,6 +28,11 @@ def result_data(
         "boards_used": len(sightings),
         "refused": [{"file": Path(r.name).name, "why": r.why} for r in calibrated.refused],
         "corners": int(sightings.seen.sum()),
+        "corners_of_a_board": sightings.pattern.count,
+        "corners_by_picture": {
+            Path(name).name: int(count)
+            for name, count in zip(sightings.names, sightings.seen.sum(1), strict=True)
+        },
         "corners_left_out": [
             {"file": Path(c.name).name, "corner": c.corner, "off_px": round(c.off_px, 3)}
             for c in calibrated.left_out

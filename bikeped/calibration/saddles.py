@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from bikeped.types import FloatArray, ImageArray, IntArray
+from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
 _SMOOTH_PX = 1.5
 _PICTURE_BLUR_PX = 0.7  # what a sharp picture has; for the contrast only
@@ -21,6 +21,8 @@ _LEAST_CONTRAST = 12.0  # grey levels
 _MOST = 2500  # of the strongest: a busy picture has thousands
 _PEAK_PX = 5  # side of the window in which a saddle is the strongest
 _OFF_PX = 1.5  # from the strongest pixel to the saddle itself
+_ROUND_PX = 3.0  # where the four squares about a saddle are looked at, ...
+_ROUND_SHARE = 0.3  # ... and of the contrast, what light and dark ones must differ by
 _NEIGHBOURS = 32  # looked at round each
 _ALIGNED = np.cos(np.radians(22.0))  # a link and the edges at both ends
 _ALONG = np.array([0.25, 0.4, 0.6, 0.75])  # where an edge is looked at
@@ -32,6 +34,7 @@ _EDGE_SHARE = 0.25  # of the contrast that an edge must keep everywhere
 class Saddles:
     """Crossings `uv_px` [n, 2], `contrast` [n] grey levels, `edge` [n, 2 (type), 2] unit vectors.
 
+    Smoothing makes right angles of slanting crossings, so edges are off by half of the difference.
     Looking along an edge of type 0, to either end, light lies to the left as the picture is seen
     (u right, v down); of type 1, to the right.
     """
@@ -66,9 +69,25 @@ def saddles(grey: ImageArray) -> Saddles:
     size = np.array([grey.shape[1] - 1, grey.shape[0] - 1])
     near = (np.abs(off) < _OFF_PX).all(1) & (at >= 0).all(1) & (at <= size).all(1)
     which = np.flatnonzero(near)
+    light = np.arctan2(2 * uv, uu - vv) / 2  # the way to where it rises fastest
+    contrast = np.sqrt(deep) * unit
+    which = which[
+        _four_squares(np.asarray(smooth, np.float32), at[which], light[which], contrast[which])
+    ]
     which = which[np.argsort(-deep[which], kind="stable")[:_MOST]]
     edge = _edges(uu[which], uv[which], vv[which])
-    return Saddles(at[which], np.sqrt(deep[which]) * unit, edge)
+    return Saddles(at[which], contrast[which], edge)
+
+
+def _four_squares(
+    smooth: Float32Array, at: FloatArray, light: FloatArray, contrast: FloatArray
+) -> BoolArray:
+    """[n] where both light squares are lighter than both dark ones: no mere corner of a square."""
+    angle = light[:, None] + np.arange(4) * np.pi / 2
+    around = at[:, None] + _ROUND_PX * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    level = _level(smooth, around)
+    least = level[:, [0, 2]].min(1) - level[:, [1, 3]].max(1)
+    return np.asarray(least > _ROUND_SHARE * contrast)
 
 
 def _edges(uu: FloatArray, uv: FloatArray, vv: FloatArray) -> FloatArray:
@@ -121,7 +140,7 @@ def _visible(
     return np.flatnonzero((level[0] - level[1] > _EDGE_SHARE * contrast[:, None]).all(1))
 
 
-def _level(grey: ImageArray, uv_px: FloatArray) -> FloatArray:
+def _level(grey: ImageArray | Float32Array, uv_px: FloatArray) -> FloatArray:
     at = np.rint(uv_px).astype(np.intp)
     u = np.clip(at[..., 0], 0, grey.shape[1] - 1)
     v = np.clip(at[..., 1], 0, grey.shape[0] - 1)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bikeped.calibration.compare import paper_criterion
 from bikeped.calibration.fit import Fit
+from bikeped.calibration.model import Sightings
 from bikeped.cli.calibrate_run import Done
 
 _MOST_NAMED = 8
@@ -28,6 +30,8 @@ def print_result(screen: Console, done: Done) -> None:
         f"{len(sightings)} of {prepared.boards_total} boards, {int(sightings.seen.sum())} corners, "
         f"{where}"
     )
+    for line in _in_part(sightings):
+        screen.print(line)
     for refused in calibrated.refused[:_MOST_NAMED]:
         screen.print(f"  not used: {escape(Path(refused.name).name)}: {escape(refused.why)}")
     if len(calibrated.refused) > _MOST_NAMED:
@@ -49,6 +53,19 @@ def print_result(screen: Console, done: Done) -> None:
     screen.print(f"field of view {done.field.fov_deg:.1f} degrees; ends at {done.field.ends_at}")
     for caution in done.cautions:
         screen.print(f"mind: {escape(caution)}")
+
+
+def _in_part(sightings: Sightings) -> list[str]:
+    """A line for each board of which some corners are not used, the emptiest first."""
+    whole, counts = sightings.pattern.count, sightings.seen.sum(1)
+    rows = [int(row) for row in np.argsort(counts, kind="stable") if counts[row] < whole]
+    lines = [
+        f"  in part: {escape(Path(sightings.names[row]).name)}, {counts[row]} of {whole} corners"
+        for row in rows[:_MOST_NAMED]
+    ]
+    if len(rows) > _MOST_NAMED:
+        lines.append(f"  and {len(rows) - _MOST_NAMED} more boards in part (--json, --report)")
+    return lines
 
 
 def _table(done: Done) -> Table:
