@@ -122,9 +122,11 @@ def _twins(pictures: Sequence[Picture]) -> dict[int, int]:
 
 
 def _sorted_out(pictures: Sequence[Picture], pattern: BoardPattern, seen: Sequence[_Seen]) -> Found:
-    """Leaves out blurred boards and those that were seen before."""
+    """Leaves out blurred boards, those that were seen before, and what may be another board."""
     blurs = [one.board.blur_px for one in seen if one.board is not None]
     usual = float(np.median(blurs)) if blurs else 0.0
+    boards = [one.board for one in seen if one.board is not None]
+    sure = any(_all_in_sight(board, pattern) for board in boards)
     views: list[BoardView] = []
     kept: list[Picture] = []
     refused: list[Refused] = []
@@ -132,6 +134,8 @@ def _sorted_out(pictures: Sequence[Picture], pattern: BoardPattern, seen: Sequen
         why = one.why
         if one.board is not None:
             why = _blurred(one.board, usual) or _before(picture, one.board, kept, views)
+            if not sure:
+                why = why or _doubtful(pattern)
         if one.board is None or why:
             refused.append(Refused(picture.name, why))
             continue
@@ -140,6 +144,25 @@ def _sorted_out(pictures: Sequence[Picture], pattern: BoardPattern, seen: Sequen
             BoardView(picture.name, one.board.ids, one.board.uv_px, picture.width, picture.height)
         )
     return Found(pattern, views, refused, len(pictures), pictures_hash(pictures))
+
+
+def _all_in_sight(board: Checked, pattern: BoardPattern) -> bool:
+    """Whether all four outer lines of the pattern show at least one corner."""
+    column, row = board.ids % pattern.columns, board.ids // pattern.columns
+    wide = column.min() == 0 and column.max() == pattern.columns - 1
+    return bool(wide and row.min() == 0 and row.max() == pattern.rows - 1)
+
+
+def _doubtful(pattern: BoardPattern) -> str:
+    """Words for boards that lack an outer line, in a set that does not show one with all four.
+
+    A board of 7x6 corners whose far edge is out of sight looks like one of 8x6 that lacks a column.
+    """
+    size = f"{pattern.columns}x{pattern.rows}"
+    return (
+        f"a row or column of {size} corners is out of sight, and no other picture shows all of "
+        "them; take one that does, or correct --pattern"
+    )
 
 
 def _blurred(board: Checked, usual_px: float) -> str:

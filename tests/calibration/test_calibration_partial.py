@@ -151,6 +151,24 @@ def test_a_few_corners_are_too_few() -> None:
 
 
 @pytest.mark.usefixtures("no_whole_board")
+def test_a_board_that_lacks_a_line_needs_another_picture_that_shows_them_all() -> None:
+    """It may be a smaller board, cut: 7x6 when 8x6 was asked for."""
+    pose = BoardPose(np.eye(3), np.array([0.0, 0.0, 0.3]))
+    uv = true_corners(CAMERA, PATTERN, pose)[0].reshape(6, 8, 2)
+    cut = draw_picture(CAMERA, PATTERN, pose, look=Look(samples=3))
+    cut[:, round(float((uv[2, 6, 0] + uv[2, 7, 0]) / 2)) :] = 0
+    pictures = [
+        Picture(f"{number}.png", 640, 480, f"{number:064x}", grey)
+        for number, grey in enumerate([cut, draw(0, 0.2)])
+    ]
+    alone = find_boards(pictures[:1], PATTERN, workers=1)
+    assert not alone.views
+    assert "no other picture shows all of them" in alone.refused[0].why
+    both = find_boards(pictures, PATTERN, workers=1)
+    assert [view.name for view in both.views] == ["0.png", "1.png"]
+
+
+@pytest.mark.usefixtures("no_whole_board")
 def test_the_lens_comes_out_as_from_whole_boards() -> None:
     found = find_boards(
         [
