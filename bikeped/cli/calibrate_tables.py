@@ -30,7 +30,7 @@ def print_result(screen: Console, done: Done) -> None:
         f"{len(sightings)} of {prepared.boards_total} boards, {int(sightings.seen.sum())} corners, "
         f"{where}"
     )
-    for line in _in_part(sightings):
+    for line in in_part(sightings):
         screen.print(line)
     for refused in calibrated.refused[:_MOST_NAMED]:
         screen.print(f"  not used: {escape(Path(refused.name).name)}: {escape(refused.why)}")
@@ -55,7 +55,7 @@ def print_result(screen: Console, done: Done) -> None:
         screen.print(f"mind: {escape(caution)}")
 
 
-def _in_part(sightings: Sightings) -> list[str]:
+def in_part(sightings: Sightings) -> list[str]:
     """A line for each board of which some corners are not used, the emptiest first."""
     whole, counts = sightings.pattern.count, sightings.seen.sum(1)
     rows = [int(row) for row in np.argsort(counts, kind="stable") if counts[row] < whole]

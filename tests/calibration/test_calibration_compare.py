@@ -128,6 +128,8 @@ def test_the_json_holds_what_people_rely_on(bent: Calibrated) -> None:
     assert data["refused"] == []
     assert data["corners"] == int(bent.prepared.sightings.seen.sum())
     assert data["corners"] >= 14 * 48 - 4  # the bend moves a corner or two out of the picture
+    assert sum(data["corners_by_picture"].values()) == data["corners"]
+    assert max(data["corners_by_picture"].values()) == data["corners_of_a_board"] == 48
     assert data["corners_left_out"] == []
     assert data["best_one_parameter_model"] == next(iter(bent.one_parameter))
     assert data["recommended"] == told.name in data["fits"]

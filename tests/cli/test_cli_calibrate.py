@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 from shared_inputs import SHARED, missing
 
+from bikeped.calibration.model import Sightings
 from bikeped.calibration.render import Look, draw_picture
 from bikeped.calibration.synthetic import BoardPose, DrawnCamera, spread_poses, turn
-from bikeped.calibration.views import BoardPattern
+from bikeped.calibration.views import BoardPattern, BoardView
+from bikeped.cli.calibrate_tables import in_part
 from bikeped.cli.main import main
 from bikeped.config import ground_camera, load_config
 from bikeped.geometry import Lens
@@ -243,6 +245,20 @@ def test_a_wrong_pattern_is_refused(calibrate: Run, pictures: Path) -> None:
     assert "no board of 11x9" in err
     assert "--pattern" in err
     assert list(Path().iterdir()) == []
+
+
+def test_boards_in_part_are_named_with_their_corners() -> None:
+    pattern = BoardPattern(4, 3)
+    views = [
+        BoardView(name, np.arange(count), np.zeros((count, 2)), 640, 480)
+        for name, count in (("a/whole.png", 12), ("a/[b].png", 11), ("c.png", 7))
+    ]
+    assert in_part(Sightings.of(pattern, views)) == [
+        "  in part: c.png, 7 of 12 corners",
+        "  in part: \\[b].png, 11 of 12 corners",
+    ]
+    many = Sightings.of(pattern, [views[1]] * 11)
+    assert in_part(many)[8:] == ["  and 3 more boards in part (--json, --report)"]
 
 
 def test_a_board_to_print(calibrate: Run) -> None:
