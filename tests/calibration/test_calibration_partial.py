@@ -120,10 +120,12 @@ def test_the_picture_is_used_and_the_reason_is_passed_on() -> None:
 
 def test_a_live_frame_has_no_time_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[BoardPattern] = []
-    monkeypatch.setattr(
-        "bikeped.calibration.corners.partial_board",
-        lambda grey, pattern: called.append(pattern) or "asked",
-    )
+
+    def asked(grey: ImageArray, pattern: BoardPattern) -> str:
+        called.append(pattern)
+        return "asked"
+
+    monkeypatch.setattr("bikeped.calibration.corners.partial_board", asked)
     assert find_board(draw(0, 0.35), PATTERN, thorough=False).board is None
     assert not called
 
