@@ -44,7 +44,7 @@ from bikeped.files import make_folder
     type=click.IntRange(64, 4096),
     default=1280,
     show_default=True,
-    help="Side of the square input, pixels; the small network's is 960 x 544.",
+    help="Side of the square input, pixels; the small network learns at 960 x 544.",
 )
 @click.option(
     "--weights",
