@@ -68,19 +68,7 @@ class OnnxBackend:
         wanted = choose_providers(config.providers, ort.get_available_providers())
         cache = Path(config.engine_cache).expanduser() / model_hash[:16]
         providers = [(name, _options(name, cache, self._source)) for name in wanted]
-        options = ort.SessionOptions()
-        options.log_severity_level = _ERRORS_ONLY
-        if config.threads:
-            options.intra_op_num_threads = config.threads
-        try:
-            self._session = ort.InferenceSession(
-                self._source, sess_options=options, providers=providers
-            )
-        except Exception as error:  # its errors share no class but this one
-            raise DetectorError(
-                f"{path}: ONNX Runtime cannot load the model ({_line(error)}); export it again or "
-                "copy it again"
-            ) from error
+        self._session = self._open(config, providers, {})
         used = self._session.get_providers()
         if used[:1] != wanted[:1]:
             log.warning(
@@ -102,13 +90,38 @@ class OnnxBackend:
                 f"{path}: input {inputs[0].name} is {inputs[0].type}; export with float32, float16 "
                 "or uint8 input"
             )
-        self.region = choose_region(config, road, is_free(inputs[0].shape))
-        spec = resolve_input(
-            inputs[0].name, inputs[0].shape, kind, self.metadata, self._source, self.region
-        )
+        shape = inputs[0].shape
+        self.region = choose_region(config, road, is_free(shape))
+        spec = resolve_input(inputs[0].name, shape, kind, self.metadata, self._source, self.region)
+        names = {side: size for side, size in zip(shape, spec.shape, strict=True) if _is_name(side)}
+        if names:  # of a known size it is planned better, and TensorRT needs no range of sizes
+            self._session = self._open(config, providers, names)
         self.buffer: npt.NDArray[Any] = spec.buffer()
         self._feed = {spec.name: self.buffer}
         self._names: list[str] = [output.name for output in self._session.get_outputs()]
+
+    def _open(
+        self,
+        config: DetectionConfig,
+        providers: list[tuple[str, dict[str, str]]],
+        sizes: dict[str, int],
+    ) -> ort.InferenceSession:
+        """A session; `sizes` of the dimensions that the model leaves free, by their names."""
+        options = ort.SessionOptions()
+        options.log_severity_level = _ERRORS_ONLY
+        if config.threads:
+            options.intra_op_num_threads = config.threads
+        # A waiting thread would burn the core on which the next picture is being decoded.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        for name, size in sizes.items():
+            options.add_free_dimension_override_by_name(name, size)
+        try:
+            return ort.InferenceSession(self._source, sess_options=options, providers=providers)
+        except Exception as error:  # its errors share no class but this one
+            raise DetectorError(
+                f"{self._source}: ONNX Runtime cannot load the model ({_line(error)}); export it "
+                "again or copy it again"
+            ) from error
 
     @property
     def description(self) -> str:
@@ -157,6 +170,10 @@ def _options(provider: str, cache: Path, source: str) -> dict[str, str]:
         "trt_timing_cache_enable": "1",
         "trt_timing_cache_path": str(cache),
     }
+
+
+def _is_name(side: object) -> bool:
+    return isinstance(side, str) and side != ""
 
 
 def _line(error: BaseException) -> str:

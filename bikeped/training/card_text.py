@@ -54,9 +54,11 @@ Measured through `bikeped.detection` at `detection.confidence` {confidence}, on 
 1920 x 1080 from seeds, places and lights that neither training nor the choice of the confidence
 saw, JPEG-encoded as a camera's; the model was shown the road of each. An object counts where at
 least 30 % of it shows and its box is 5 pixels wide at 960 across (what benchmarks call reasonable
-is 65 %: told apart below); it is found where a box of its kind overlaps it by half. The error is
-that of the box's bottom centre on the ground against the object's true middle: the near face of
-what has a depth is always nearer than its middle.
+is 65 %: told apart below); it is found where a box of its kind overlaps it by half. A
+detection is false where it overlaps nobody of its kind by even a tenth, and nobody of another kind
+by half, or is the second of one person. The error is that of the box's bottom centre on the ground
+against the object's true middle: the near face of what has a depth is always nearer than its
+middle.
 
 {verdict}
 """
@@ -135,9 +137,12 @@ def _measured(title: str, test: Mapping[str, Any]) -> str:
     false = test["false_pedestrian_or_cyclist_per_100_frames"]
     cars = test["kinds"]["vehicle"]["false_per_100_frames"]
     other = test["another_kind_pedestrian_or_cyclist_per_100_frames"]
+    loose = test["loose_pedestrian_or_cyclist_per_100_frames"]
     said = f"{test['frames']} frames from seed {test['seed']}. A 100 frames have {false:g} false "
-    said += f"pedestrians or cyclists, {cars:g} false vehicles, and {other:g} pedestrians or "
-    said += "cyclists that are road users of another kind."
+    said += f"pedestrians or cyclists, {cars:g} false vehicles, {other:g} pedestrians or cyclists "
+    said += (
+        f"that are road users of another kind, and {loose:g} that are boxed too loosely to count."
+    )
     lines = [f"### {title}", "", said]
     for kind in Kind:
         numbers = test["kinds"][kind.label]

@@ -69,6 +69,15 @@ def test_misses_wrong_kinds_and_doubles(view):
     assert rows[0].on_other
     (nobody, _) = judge_picture(found((CYC, 0.9, (10, 300, 30, 350))), [thing(BOX)], view)
     assert not nobody.on_other
+    # Moved by shares of his width: overlaps of 0.43, 0.18 and 0.05.
+    for shift, loose in ((0.4, True), (0.7, True), (0.9, False)):
+        u1, v1, u2, v2 = BOX
+        beside = (u1 + shift * (u2 - u1), v1, u2 + shift * (u2 - u1), v2)
+        rows = judge_picture(found((PED, 0.9, beside)), [thing(BOX)], view)
+        assert [(s.found, s.loose, s.on_other) for s in rows] == [
+            (False, loose, False),
+            (False, False, False),
+        ]
     rows = judge_picture(found((PED, 0.9, BOX), (PED, 0.8, BOX)), [thing(BOX)], view)
     assert [(s.found, math.isnan(s.distance_m)) for s in rows] == [(False, True), (True, False)]
     assert not rows[0].on_other
@@ -94,6 +103,7 @@ def sights():
             Sight(CYC, NAN, False, 0.3, NAN),
             Sight(Kind.VEHICLE, NAN, False, 0.9, NAN),
             Sight(PED, NAN, False, 0.9, NAN, True),
+            Sight(PED, NAN, False, 0.9, NAN, loose=True),
         ],
     ]
 
@@ -113,6 +123,7 @@ def test_the_summary_counts_at_a_confidence():
     assert numbers["false_pedestrian_or_cyclist_per_100_frames"] == 50
     assert walkers["another_kind_per_100_frames"] == 50
     assert numbers["another_kind_pedestrian_or_cyclist_per_100_frames"] == 50
+    assert (walkers["loose_per_100_frames"], walkers["false_per_100_frames"]) == (50, 0)
     assert summary(sights(), 0.35)["false_pedestrian_or_cyclist_per_100_frames"] == 0
     assert summary(sights(), 0.1)["kinds"]["pedestrian"]["within_15_m"]["recall"] == 1
 
