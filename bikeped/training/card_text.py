@@ -46,7 +46,8 @@ The input is RGB / 255, the picture centred on grey 114, with any sides that are
 configured camera ({road_macs:.2f}; `detection.region: auto` shows a camera's road and nothing
 else). The output is laid out as `yolov8`. The scores of each class are shifted so that the default
 `detection.confidence` of {confidence} is the one chosen for it on the validation pictures, where at
-most {most_false} a 100 frames were false; a score is no probability.
+most {most_false} a 100 frames were false{choice}; a score is
+no probability.
 
 ## What it is worth
 
@@ -101,6 +102,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         torch=training["torch"],
         beside=made.get("beside", ""),
         confidence=test["confidence"],
+        choice=made.get("choice", ""),
         verdict=_verdict(test),
         most_false=", ".join(f"{n:g} {name}s" for name, n in made["most_false"].items()),
     )
