@@ -8,6 +8,7 @@ from typing import Any
 from bikeped.types import Kind
 
 AIM_RECALL, AIM_FALSE = 0.95, 1.0
+_LITTLE_AP = 0.2  #: of all road users: less is no trained network
 _WALKS_AND_RIDES = (Kind.PEDESTRIAN, Kind.CYCLIST)
 
 _HEAD = """# The small detector that comes with bikeped
@@ -210,6 +211,11 @@ def _experiment(experiment: Mapping[str, Any]) -> str:
     for name, a, b in rows:
         factor = "-" if not a["ap"] or b["ap"] is None else f"{b['ap'] / a['ap']:.2f}"
         lines.append(f"| {name}, AP@50:95 | {_three(a['ap'])} | {_three(b['ap'])} | {factor} |")
+    if max(row["ap"] or 0.0 for row in rows[0][1:]) < _LITTLE_AP:
+        lines += [
+            "",
+            "Neither has learnt much in so few steps: this says little about a longer training.",
+        ]
     return "\n".join(lines) + "\n"
 
 
