@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -96,3 +97,9 @@ def set_up_logging(level: str) -> None:
         form = "%(asctime)s " + form
     logging.basicConfig(level=level.upper(), format=form, stream=sys.stderr)
     logging.getLogger("asyncio").setLevel(logging.WARNING)
+
+
+def width_height(text: str) -> tuple[int, int] | None:
+    """Width and height of a text like 1920x1080; None where it is none."""
+    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    return None if match is None else (int(match[1]), int(match[2]))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.markup import escape
 
-from bikeped.cli.common import console, json_option, write_json
+from bikeped.cli.common import console, json_option, width_height, write_json
 from bikeped.cli.guard import guarded
 from bikeped.errors import DetectorError
 
@@ -103,13 +102,12 @@ def _expect(path: Path, suffix: str) -> None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
-    sides = tuple(int(side) for side in match.groups()) if match else ()
-    if len(sides) != 2 or any(side % 32 or side == 0 for side in sides):
+    size = width_height(text)
+    if size is None or any(side % 32 or side == 0 for side in size):
         raise DetectorError(
             f"--input {text}: is no WIDTHxHEIGHT in multiples of 32; for example 1280x416"
         )
-    return sides[0], sides[1]
+    return size
 
 
 def _print(summary: dict[str, Any]) -> None:

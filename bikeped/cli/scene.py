@@ -16,6 +16,7 @@ from bikeped.cli.common import (
     console,
     json_option,
     progress_bar,
+    width_height,
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded, written_paths
@@ -289,10 +290,10 @@ def _slug(name: str) -> str:
 
 
 def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
-    if match is None:
+    size = width_height(text)
+    if size is None:
         raise BikepedError(f"--size {text}: is not WIDTHxHEIGHT; write e.g. 1920x1080")
-    return int(match[1]), int(match[2])
+    return size
 
 
 def _tell(summary: dict[str, Any], json_path: str | None, line: str) -> None:

@@ -113,9 +113,8 @@ def resolve_input(
             "three channels first"
         )
     known_width, known_height = metadata.image_size or (_DEFAULT_SIZE, _DEFAULT_SIZE)
-    free = height is None
     width, height = width or known_width, height or known_height
-    if free and region is not None:
+    if region is not None and is_free(shape):
         shape_of_it = region.aspect * (region.right - region.left) / (region.bottom - region.top)
         rows = width / shape_of_it
         wanted = math.ceil((rows + _EDGE_PX) / _COARSEST) * _COARSEST
@@ -134,8 +133,10 @@ def resolve_input(
 
 
 def is_free(shape: Sequence[object]) -> bool:
-    """Whether the input's height may be chosen."""
-    return len(shape) == 4 and not (isinstance(shape[2], int) and shape[2] > 0)
+    """Whether the input's height may be chosen, whatever its width: not where they share a name."""
+    if len(shape) != 4 or (isinstance(shape[2], int) and shape[2] > 0):
+        return False
+    return not isinstance(shape[2], str) or shape[2] != shape[3]
 
 
 def choose_region(config: DetectionConfig, road: Region | None, free: bool) -> Region | None:

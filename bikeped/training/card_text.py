@@ -38,7 +38,7 @@ others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 
 | seeds | pictures {seed_data}, training {seed}; validation and tests from seeds of their own |
 | drawing | {drawing_min:.0f} min{drawing_note} |
 | training | {steps} steps, {training_min:.0f} min |
-| first {packed:.0%} | {squares} squares of {side} pixels a step, full of windows{things} |
+| first {packed:.0%} | {squares} squares of {side} pixels; {things:.0%} of windows around things |
 | then | {windows} windows of 480 x 288 pixels a step |
 | machine | {machine}; PyTorch {torch} on the CPU, two threads{beside} |
 
@@ -47,20 +47,18 @@ The input is RGB / 255, the picture centred on grey 114, with any sides that are
 configured camera ({road_macs:.2f}; `detection.region: auto` shows a camera's road and nothing
 else). The output is laid out as `yolov8`. The scores of each class are shifted so that the default
 `detection.confidence` of {confidence} is the one chosen for it on the validation pictures, where at
-most {most_false} a 100 frames were false{choice}; a score is
-no probability.
+most {most_false} a 100 frames were false{choice}; a score is no probability.
 
 ## What it is worth
 
 Measured through `bikeped.detection` at `detection.confidence` {confidence}, on pictures drawn at
-1920 x 1080 from seeds, places and lights that neither training nor the choice of the confidence
-saw, JPEG-encoded as a camera's; the model was shown the road of each. An object counts where at
-least 30 % of it shows and its box is 5 pixels wide at 960 across (what benchmarks call reasonable
-is 65 %: told apart below); it is found where a box of its kind overlaps it by half. A
-detection is false where it overlaps nobody of its kind by even a tenth, and nobody of another kind
-by half, or is the second of one person. The error is that of the box's bottom centre on the ground
-against the object's true middle: the near face of what has a depth is always nearer than its
-middle.
+1920 x 1080 from seeds, places and lights of which training and validation saw none, JPEG-encoded as
+a camera's; the model was shown the road of each. An object counts where at least 30 % of it shows
+and its box is 5 pixels wide at 960 across (what benchmarks call reasonable is 65 %: told apart
+below); it is found where a box of its kind overlaps it by half. A detection is false where it
+overlaps nobody of its kind by even a tenth, and nobody of another kind by half, or is the second of
+one person. The error is that of the box's bottom centre on the ground against the object's true
+middle: the near face of what has a depth is always nearer than its middle.
 
 {verdict}
 """
@@ -73,7 +71,6 @@ def card_text(card: Mapping[str, Any]) -> str:
     model, made = card["model"], card["made"]
     training, test = made["training"], card["configured_camera"]
     settings = training["settings"]
-    things = settings["pack"].get("furniture", 0.0)
     text = _HEAD.format(
         weights=model["weights"],
         megabytes=model["bytes"] / 1e6,
@@ -92,9 +89,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         packed=settings["packed"],
         squares=settings["pack"]["squares"],
         side=settings["pack"]["side"],
-        things=f" around objects, {things:.0%} around things that are nobody"
-        if things
-        else " around objects",
+        things=settings["pack"]["furniture"],
         input=" x ".join(str(side) for side in model["input"]),
         macs=model["multiply_adds"] / 1e9,
         road=" x ".join(str(side) for side in model["road_input"]),

@@ -75,7 +75,7 @@ def build_engine(
             "export with a lower opset"
         )
     config = builder.create_builder_config()
-    _fix_size(network, builder, config, size or known.image_size, size is not None, model)
+    _fix_size(network, builder, config, model, size, known.image_size)
     config.set_memory_pool_limit(trt.MemoryPoolType.WORKSPACE, workspace_mb * _MB)
     half = half and bool(builder.platform_has_fast_fp16)
     if half:
@@ -96,22 +96,24 @@ def _fix_size(
     network: Any,
     builder: Any,
     config: Any,
-    size: tuple[int, int] | None,
-    asked: bool,
     model: Path,
+    asked: tuple[int, int] | None,
+    known: tuple[int, int] | None,
 ) -> None:
-    """Gives an input that may have any size the one that it will have; a fixed one must have it."""
+    """Gives an input that may have any size the one that is asked for, else the one that the model
+    knows; a fixed one must have what is asked for."""
     taken = network.get_input(0)
     shape = list(taken.shape)
     if len(shape) != 4:
         return  # the loader says what is wrong with it
     if all(side > 0 for side in shape):
-        if asked and size is not None and (shape[3], shape[2]) != size:
+        if asked is not None and (shape[3], shape[2]) != asked:
             raise DetectorError(
-                f"{model}: its input is {shape[3]} x {shape[2]}, not {size[0]} x {size[1]}; leave "
-                "out --input, or export the model for any size"
+                f"{model}: its input is {shape[3]} x {shape[2]}, not {asked[0]} x {asked[1]}; "
+                "leave out --input, or export the model for any size"
             )
         return
+    size = asked or known
     if size is None:
         raise DetectorError(
             f"{model}: takes pictures of any size and does not say which; name one with --input"

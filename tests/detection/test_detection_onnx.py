@@ -169,6 +169,15 @@ def test_a_model_of_one_size_is_shown_the_road_only_where_asked(tmp_path, region
     assert y == pytest.approx(410 if rows else 250, abs=0.01)
 
 
+def test_a_height_that_must_be_the_width_is_not_chosen(tmp_path):
+    answer = np.zeros((1, 7, 12 * 12 + 6 * 6 + 3 * 3), np.float32)
+    facts = {**ULTRALYTICS, "imgsz": "[96, 96]"}
+    square = save(tmp_path / "m.onnx", answer, facts, (1, 3, "side", "side"))
+    assert load(square, ROAD).input_size == (96, 96)
+    free = save(tmp_path / "free.onnx", answer[:, :, :126], facts, (1, 3, "height", "width"))
+    assert load(free, ROAD).input_size == (96, 64)
+
+
 def test_half_precision_answers(tmp_path):
     path = save(tmp_path / "m.onnx", answer_of("yolov8").astype(np.float16), ULTRALYTICS)
     found = load(path).infer(grey(), *FRAME).detections
