@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from bikeped.cli.common import console, progress_bar
+from bikeped.cli.common import console, progress_bar, width_height
 from bikeped.cli.conformance_shared import begin, cores, emit, processes_option, suite_options
 from bikeped.cli.guard import guarded
 from bikeped.errors import BikepedError
@@ -14,11 +14,9 @@ from bikeped.files import make_folder
 
 
 def _size(text: str) -> tuple[int, int]:
-    parts = text.lower().split("x")
-    if len(parts) == 2 and all(p.isdigit() for p in parts):
-        width, height = (int(p) for p in parts)
-        if 160 <= width <= 7680 and 90 <= height <= 4320:
-            return width, height
+    size = width_height(text)
+    if size is not None and 160 <= size[0] <= 7680 and 90 <= size[1] <= 4320:
+        return size
     raise BikepedError(f"--size {text}: give width x height in pixels, e.g. 1920x1080")
 
 

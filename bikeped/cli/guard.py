@@ -28,6 +28,7 @@ _INPUTS = {
     "images": "IMAGES",
     "models": "MODEL",
     "weights": "WEIGHTS",
+    "int8": "--int8",
     "validation": "--validation",
     "challenge": "FILE_OR_LINK",
     "picture": "FRAME",

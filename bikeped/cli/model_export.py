@@ -39,6 +39,13 @@ from bikeped.errors import DetectorError
     help="Size of the engine's input, multiples of 32, for a model that takes any. "
     "Default: what the model says.",
 )
+@click.option(
+    "--int8",
+    type=click.Path(path_type=Path),
+    metavar="DATA",
+    help="Round the small network to eight bits: about twice as quick on a processor without a "
+    "GPU. DATA: pictures in COCO's format that the steps are taken from.",
+)
 @click.option("--full-precision", is_flag=True, help="An engine without 16-bit floats.")
 @click.option(
     "--workspace-mb",
@@ -55,12 +62,18 @@ def command(
     engine: Path | None,
     size: int,
     input_size: str | None,
+    int8: Path | None,
     full_precision: bool,
     workspace_mb: int,
     json_path: str | None,
 ) -> int:
     """Export WEIGHTS (weights.pt of `model train`, or an .onnx file) to ONNX and TensorRT."""
     summary: dict[str, Any] = {}
+    if int8 is not None and (engine is not None or weights.suffix.lower() == ".onnx"):
+        raise DetectorError(
+            f"--int8: rounds what `model train` wrote, for a processor; leave out "
+            f"{'--engine' if engine is not None else 'the ONNX file and name weights.pt'}"
+        )
     if weights.suffix.lower() == ".onnx":
         if out is not None or engine is None:
             raise DetectorError(
@@ -76,7 +89,7 @@ def command(
 
         model = weights.with_suffix(".onnx") if out is None else out
         _expect(model, ".onnx")
-        summary = export_any(weights, model, size)
+        summary = export_any(weights, model, size, int8)
     if engine is not None:
         from bikeped.training.engine import build_engine
 

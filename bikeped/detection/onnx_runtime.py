@@ -152,6 +152,14 @@ def choose_providers(wanted: tuple[str, ...], available: list[str]) -> list[str]
     return chosen
 
 
+def runs_on_cpu(wanted: tuple[str, ...]) -> bool:
+    """Whether the first of the wanted providers that is present is the processor.
+
+    Raises `DetectorError` where none is.
+    """
+    return choose_providers(wanted, ort.get_available_providers())[0] == _PROVIDERS["cpu"]
+
+
 def _options(provider: str, cache: Path, source: str) -> dict[str, str]:
     """Options of a provider (onnxruntime.ai, execution providers, TensorRT)."""
     if provider != _PROVIDERS["tensorrt"]:

@@ -14,8 +14,15 @@ NOT_FOR_STREETS = (
     "the bundled model knows drawn streets only; it must not warn anybody on a real one"
 )
 BUNDLED_FILE = Path(__file__).with_name("small.onnx")
+#: The same network in eight bits, which a processor without a GPU answers in half of the time.
+BUNDLED_INT8_FILE = Path(__file__).with_name("small-int8.onnx")
 
 
-def model_file(model: str, base_dir: Path) -> Path:
-    """The file that `detection.model` names; a relative one starts from `base_dir`."""
-    return BUNDLED_FILE if model == BUNDLED else base_dir / Path(model).expanduser()
+def model_file(model: str, base_dir: Path, *, on_cpu: bool = False) -> Path:
+    """The file that `detection.model` names; a relative one starts from `base_dir`.
+
+    `on_cpu`: it will run on the processor, not on a GPU.
+    """
+    if model == BUNDLED:
+        return BUNDLED_INT8_FILE if on_cpu else BUNDLED_FILE
+    return base_dir / Path(model).expanduser()

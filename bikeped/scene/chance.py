@@ -15,9 +15,16 @@ _DURATION_S = 6.0
 _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
 
-def random_scenario(seed: int) -> Scenario:
+#: Share of e-scooters among cyclists.
+SCOOTERS = 0.25
+
+
+def random_scenario(seed: int, scooters: float = SCOOTERS) -> Scenario:
     """A scenario of 6 s: walkers, children, wheelchairs, cyclists, e-scooters and vehicles, none to
-    a crowd, 1.5 to 40 m before the usual camera, in all directions, some standing still."""
+    a crowd, 1.5 to 40 m before the usual camera, in all directions, some standing still.
+
+    `scooters`: the share of e-scooters among the cyclists.
+    """
     rng = np.random.default_rng((seed, 41))
     busy = float(rng.choice([0.3, 1.0, 1.8]))
     agents: list[Agent] = []
@@ -60,7 +67,7 @@ def random_scenario(seed: int) -> Scenario:
         speed = 0.0 if rng.random() < 0.3 else float(rng.uniform(0.6, 1.8))
         add("pedestrian", size, speed, 0.8 if rng.random() < 0.25 else 0.0)
     for _ in range(int(rng.poisson(2.6 * busy))):
-        size = varied("cyclist", 0.05) if rng.random() < 0.75 else (1.2, 0.5, 1.75)
+        size = varied("cyclist", 0.05) if rng.random() >= scooters else (1.2, 0.5, 1.75)
         speed = 0.0 if rng.random() < 0.12 else float(rng.uniform(2.0, 9.0))
         add("cyclist", size, speed, 1.2 if rng.random() < 0.15 else 0.0)
     for _ in range(int(rng.poisson(0.9 * busy))):

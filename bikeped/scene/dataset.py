@@ -15,7 +15,7 @@ import numpy as np
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder
 from bikeped.scene.camera import SceneCamera
-from bikeped.scene.chance import random_camera, random_scenario
+from bikeped.scene.chance import SCOOTERS, random_camera, random_scenario
 from bikeped.scene.clip import encode_jpeg
 from bikeped.scene.conditions import Conditions, random_conditions
 from bikeped.scene.labels import DrawnObject
@@ -48,18 +48,22 @@ def pictures(
     *,
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
+    scooters: float = SCOOTERS,
 ) -> Iterator[DrawnPicture]:
     """`count` drawn pictures with their objects: random scenarios, lights, weathers and places.
 
     `camera`: for all of them; None draws a camera for every street (`lens`: fisheye or
-    rectilinear). Equal arguments give equal pictures; a larger `count` begins with the same ones.
+    rectilinear). `scooters`: as `random_scenario` has it. Equal arguments give equal pictures; a
+    larger `count` begins with the same ones.
     """
     for number in range(count):
         street = seed * 1_000_003 + number // _PER_STREET
         conditions = random_conditions(street)
         view = camera or random_camera(street, size, lens)
         rng = np.random.default_rng((seed, number, 59))
-        painter = ScenePainter(random_scenario(seed * 1_000_003 + number), view, conditions)
+        painter = ScenePainter(
+            random_scenario(seed * 1_000_003 + number, scooters), view, conditions
+        )
         image, objects = painter.draw(float(rng.uniform(0.2, 5.8)))
         yield DrawnPicture(image, objects, conditions, view, painter.furniture())
 
@@ -72,6 +76,7 @@ def write_dataset(
     *,
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
+    scooters: float = SCOOTERS,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Writes `folder`/images/*.jpg and `folder`/annotations.json; returns the latter.
@@ -99,7 +104,7 @@ def write_dataset(
         (partial / "images").mkdir()
         images: list[dict[str, Any]] = []
         notes: list[dict[str, Any]] = []
-        drawn = pictures(count, seed, camera, size=size, lens=lens)
+        drawn = pictures(count, seed, camera, size=size, lens=lens, scooters=scooters)
         for number, one in enumerate(drawn):
             name = f"{number:06d}.jpg"
             quality = 78 + (seed * 7 + number * 5) % 18

@@ -50,8 +50,9 @@ class CocoObject:
     """One annotation: `box_px` x1, y1, x2, y2, within the picture; `crowd` stands for many.
 
     `polygons` are the outlines [n, 2] of its segmentation in picture pixels, empty where it has
-    none or a run-length mask. `distance_m` from the camera's foot is bikeped's own addition: drawn
-    pictures have it.
+    none or a run-length mask. `distance_m` from the camera's foot and `visible`, the share of it
+    that is neither hidden nor outside the picture, are bikeped's own additions: drawn pictures
+    have them.
     """
 
     id: int
@@ -61,6 +62,7 @@ class CocoObject:
     crowd: bool = False
     polygons: tuple[FloatArray, ...] = field(repr=False, default=(), compare=False)
     distance_m: float | None = None
+    visible: float | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ class _Annotation(msgspec.Struct):
     iscrowd: int | bool = 0
     segmentation: Any = None
     distance_m: float | None = None
+    visible: float | None = None
 
 
 class _Category(msgspec.Struct):
@@ -337,6 +340,7 @@ def _objects(
                 bool(entry.iscrowd),
                 _polygons(where, entry.segmentation),
                 entry.distance_m,
+                entry.visible,
             )
         )
     ordered = {

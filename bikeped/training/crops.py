@@ -22,6 +22,8 @@ from bikeped.types import FloatArray, ImageArray, IntArray
 
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
 _LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
+_WHOLE = 0.97  #: of an object that shows, or it is hidden in part
+_TURNS_OF_HIDDEN = 2
 LARGEST_WINDOW_PX = 256  #: of those whose size is asked for one by one
 _NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest in grey levels
 
@@ -30,11 +32,11 @@ _NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest i
 class CropSettings:
     """How windows are cut and changed; every range is drawn from evenly."""
 
-    view: tuple[int, int] = (960, 544)  #: width and height of the network's input, pixels
+    view: tuple[int, int] = (1280, 736)  #: width and height of the network's input, pixels
     window: tuple[int, int] = (480, 288)
     around_object: float = 0.65  #: share of windows that are cut around an object
     around_usual: float = 0.2  #: share cut where some other picture has an object
-    scale: tuple[float, float] = (0.85, 1.4)
+    scale: tuple[float, float] = (0.72, 1.1)
     flip: float = 0.5
     cover: float = 0.15  #: share of windows with something in front of an object
     light: float = 0.7  #: share of windows whose light and colours are changed
@@ -60,6 +62,12 @@ class View:
     crowd: IntArray  #: 1 where a box stands for many
     #: What stands there and is nobody, where the data tell: kind of thing -> boxes [n, 4].
     furniture_px: Mapping[str, FloatArray] = field(default_factory=dict)
+    #: Numbers of the objects that the data call hidden in part, or cut by the picture's edge.
+    hidden: frozenset[int] = frozenset()
+
+    def turns(self, index: int) -> int:
+        """How often an object is drawn lots for: who is hidden in part is rarer, and harder."""
+        return _TURNS_OF_HIDDEN if index in self.hidden else 1
 
 
 def class_ids(data: CocoData) -> dict[int, int]:
@@ -83,6 +91,7 @@ def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
         np.array([known[o.category_id] for o in found], np.int64),
         np.array([o.crowd for o in found], np.int64),
         _furniture(image, fit),
+        frozenset(i for i, o in enumerate(found) if o.visible is not None and o.visible < _WHOLE),
     )
 
 
@@ -200,6 +209,7 @@ class Cutter:
             # First the class, then the object: parked cars must not crowd out who walks.
             kinds = np.unique(view.class_id)
             mine = np.flatnonzero(view.class_id == kinds[int(random.integers(len(kinds)))])
+            mine = np.repeat(mine, [view.turns(int(index)) for index in mine])
             box = view.box_px[mine[int(random.integers(len(mine)))]]
             middle = (box[:2] + box[2:]) / 2
             left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)

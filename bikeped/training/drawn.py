@@ -28,7 +28,7 @@ from bikeped.training.coco import write_annotations
 #: Seeds of parts begin here, so that no set shares a street with another: training from
 #: `seed` * this, below the next one.
 SEEDS_A_SET = 10_000
-_SMALL, _LARGE = (960, 540), (1920, 1080)
+_SMALL, _LARGE = (1280, 720), (1920, 1080)
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,9 @@ class DrawnSettings:
     seed: int = 1
     part: int = 20  #: pictures that share a camera
     configured: float = 0.7  #: share of parts seen by the configured camera
-    large: float = 0.5  #: share of parts drawn at 1920 x 1080, the others at 960 x 540
+    large: float = 0.5  #: share of parts drawn at 1920 x 1080, the others at 1280 x 720
     lens: str = "fisheye"  #: of the other cameras: fisheye or rectilinear
+    scooters: float = 0.45  #: share of e-scooters among the cyclists: they are hard to tell
     processes: int = 2
 
 
@@ -119,4 +120,5 @@ def _draw(
         camera,
         size=size,
         lens=settings.lens,
+        scooters=settings.scooters,
     )

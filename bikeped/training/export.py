@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import io
 import json
+import tempfile
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -150,10 +151,31 @@ def compare(
     return box, score
 
 
-def export_any(weights: Path, out: Path, size: int) -> dict[str, Any]:
-    """Exports whatever `model train` wrote: the small network's weights, or a YOLO's (`size`)."""
-    if not is_small(weights):
-        from bikeped.training.yolo import export_yolo
+def export_any(weights: Path, out: Path, size: int, int8: Path | None = None) -> dict[str, Any]:
+    """Exports whatever `model train` wrote: the small network's weights, or a YOLO's (`size`).
 
-        return export_yolo(weights, out, size)
-    return export_weights(weights, out).as_dict()
+    `int8`: a data set from whose pictures the steps of eight-bit numbers are taken; the small
+    network only. Raises DetectorError and DataSetError.
+    """
+    if is_small(weights):
+        summary = export_weights(weights, out) if int8 is None else _in_int8(weights, out, int8)
+        return summary.as_dict()
+    if int8 is not None:
+        raise DetectorError(
+            f"--int8: {weights} is no small network's; export without it, and let TensorRT or ONNX "
+            "Runtime round a YOLO"
+        )
+    from bikeped.training.yolo import export_yolo
+
+    return export_yolo(weights, out, size)
+
+
+def _in_int8(weights: Path, out: Path, data: Path) -> ExportSummary:
+    from bikeped.training.coco import read_coco
+    from bikeped.training.quantise import PICTURES, quantise, shown_pictures
+
+    pictures = read_coco(data)
+    with tempfile.TemporaryDirectory() as folder:
+        summary = export_weights(weights, Path(folder) / "float.onnx")
+        shown = shown_pictures(pictures, summary.size, PICTURES)
+        return replace(summary, path=out, bytes=quantise(summary.path, shown, out))

@@ -37,7 +37,7 @@ from bikeped.training.muon import Muon
 from bikeped.training.network import STRIDES, SmallNet, grid
 from bikeped.training.packing import BLOCK_PX, Packer, PackSettings
 
-FORMAT = "bikeped small detector 1"
+FORMAT = "bikeped small detector 2"
 _REPORT_EVERY = 100  #: steps
 _STEEPEST_GRADIENT = 10.0
 

@@ -1,11 +1,11 @@
-"""Our own small detector: a convolutional network of 474,000 weights.
+"""Our own small detector: a convolutional network of 700,000 weights.
 
 One stage, no anchors: three grids of strides 8, 16 and 32 pixels, each cell of which says how
 likely a road user of each class has its middle there and how far its four edges are from the cell's
 own centre. Only plain convolutions and ReLU, which every runtime has fast code for.
 
     stem    3 -> 16 -> 32 channels at 1/4 of the picture's size, where wheels are told from legs
-    stages  64, 96, 128 channels at 1/8, 1/16, 1/32; each a few convolutions on half of the
+    stages  64, 112, 160 channels at 1/8, 1/16, 1/32; each a few convolutions on half of the
             channels, whose answers are all joined (as in CSP and ELAN networks)
     neck    from coarse to fine, so that small figures are seen with what surrounds them
     heads   one convolution, then scores and edges
@@ -76,8 +76,8 @@ class SmallNet(nn.Module):
     def __init__(
         self,
         classes: int,
-        widths: tuple[int, ...] = (16, 32, 64, 96, 128),
-        depths: tuple[int, ...] = (2, 2, 1),
+        widths: tuple[int, ...] = (16, 32, 64, 112, 160),
+        depths: tuple[int, ...] = (2, 3, 2),
         neck: int = 48,
     ) -> None:
         super().__init__()

@@ -153,7 +153,8 @@ def _by_class(pool: Sequence[View]) -> list[list[tuple[int, int]]]:
     found: list[list[tuple[int, int]]] = [[] for _ in range(most + 1)]
     for number, view in enumerate(pool):
         for index in np.flatnonzero(view.crowd == 0).tolist():
-            found[int(view.class_id[index])].append((number, index))
+            lots = [(number, index)] * view.turns(index)
+            found[int(view.class_id[index])].extend(lots)
     return found
 
 

@@ -63,7 +63,7 @@ def test_the_small_network_from_data_to_model(data, tmp_path, capsys):
     summary = json.loads(capsys.readouterr().out)
     assert json.loads((out / "training.json").read_text()) == summary
     assert summary["names"] == ["person", "bicycle", "car"]
-    assert (summary["pictures"], summary["objects"], summary["size"]) == (4, 4, [960, 544])
+    assert (summary["pictures"], summary["objects"], summary["size"]) == (4, 4, [1280, 736])
     assert summary["settings"]["steps"] == 2
     assert (out / "model.onnx").stat().st_size == summary["model_bytes"] < 4e6
 
@@ -73,6 +73,24 @@ def test_the_small_network_from_data_to_model(data, tmp_path, capsys):
     assert again.read_bytes() == (out / "model.onnx").read_bytes()
     assert main(["model", "export", str(out / "weights.pt"), "--out", str(out / "m.pt")]) == 2
     assert "end it with .onnx" in said(capsys)
+
+    small = tmp_path / "int8.onnx"
+    order = ["model", "export", str(out / "weights.pt"), "--out", str(small), "--int8"]
+    assert main([*order, str(data), "--json", "-"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["bytes"] == small.stat().st_size < again.stat().st_size / 2.5
+    assert main([*order, str(tmp_path / "nothing")]) == 2
+    assert "nothing" in said(capsys)
+
+
+def test_only_what_was_trained_is_rounded(tmp_path, capsys):
+    model = tmp_path / "model.onnx"
+    model.write_bytes(b"nothing")
+    assert main(["model", "export", str(model), "--int8", str(tmp_path)]) == 2
+    assert "name weights.pt" in said(capsys)
+    order = ["model", "export", str(tmp_path / "weights.pt"), "--int8", str(tmp_path)]
+    assert main([*order, "--engine", str(tmp_path / "model.engine")]) == 2
+    assert "leave out --engine" in said(capsys)
 
 
 @with_torch

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.detection.onnx_runtime import _options, choose_providers
+from bikeped.detection.onnx_runtime import _options, choose_providers, runs_on_cpu
 from bikeped.errors import DetectorError
 from bikeped.types import Kind, Region
 
@@ -399,6 +399,15 @@ def test_providers_keep_the_configured_order_and_skip_the_absent():
     assert choose_providers(("tensorrt", "cuda", "cpu"), here[2:]) == ["CPUExecutionProvider"]
     with pytest.raises(DetectorError, match=r"detection\.providers"):
         choose_providers(("cuda",), here[2:])
+
+
+def test_whether_it_runs_on_the_processor(monkeypatch):
+    gpu, cpu = "CUDAExecutionProvider", "CPUExecutionProvider"
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [gpu, cpu])
+    assert not runs_on_cpu(("tensorrt", "cuda", "cpu"))
+    assert runs_on_cpu(("cpu", "cuda"))
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [cpu])
+    assert runs_on_cpu(("tensorrt", "cuda", "cpu"))
 
 
 def test_tensorrt_keeps_its_engines_in_a_folder_of_the_model(tmp_path):

@@ -9,11 +9,21 @@ import pytest
 
 from bikeped.cli.main import main
 from bikeped.config import load_config, road_region
+from bikeped.config.sections import DetectionConfig
+from bikeped.conformance.scenario import bundled_folder, load_scenario
 from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
-from bikeped.models import BUNDLED, BUNDLED_FILE, NOT_FOR_STREETS, model_file
+from bikeped.models import (
+    BUNDLED,
+    BUNDLED_FILE,
+    BUNDLED_INT8_FILE,
+    NOT_FOR_STREETS,
+    model_file,
+)
+from bikeped.scene import ScenePainter, scene_camera
 from bikeped.service.doctor import check_model
 from bikeped.training.card_text import reached
+from bikeped.types import Kind
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +50,10 @@ def test_it_loads_without_being_told_anything_about_it(loaded):
 
 def test_the_card_is_this_files(card):
     assert card["model"]["sha256"] == sha256_of(BUNDLED_FILE)
-    assert card["model"]["bytes"] == BUNDLED_FILE.stat().st_size <= 4_000_000
+    assert card["model"]["bytes"] == BUNDLED_FILE.stat().st_size
+    assert card["model"]["int8_sha256"] == sha256_of(BUNDLED_INT8_FILE)
+    assert card["model"]["int8_bytes"] == BUNDLED_INT8_FILE.stat().st_size
+    assert BUNDLED_FILE.stat().st_size + BUNDLED_INT8_FILE.stat().st_size <= 4_000_000
     text = BUNDLED_FILE.with_suffix(".md").read_text()
     assert "must not be used for a street" in text
 
@@ -60,10 +73,30 @@ def test_the_card_says_whether_its_aim_is_reached(card):
 
 def test_bundled_is_no_file_name(tmp_path):
     assert model_file(BUNDLED, tmp_path) == BUNDLED_FILE
-    assert model_file("other.onnx", tmp_path) == tmp_path / "other.onnx"
+    assert model_file(BUNDLED, tmp_path, on_cpu=True) == BUNDLED_INT8_FILE
+    for on_cpu in (False, True):
+        assert model_file("other.onnx", tmp_path, on_cpu=on_cpu) == tmp_path / "other.onnx"
     config = tmp_path / "config.yaml"
     config.write_text("camera: {radius_px: 1750, fov_deg: 197.9}\ndetection: {model: bundled}\n")
     assert load_config(config).config.detection.model == BUNDLED
+
+
+def test_a_processor_gets_it_in_eight_bits(loaded):
+    detector = load_detector(loaded.config.detection, loaded.base_dir)
+    assert ("small-int8.onnx" in detector.name) == ("CPU" in detector.name)
+    assert detector.model_hash in {sha256_of(BUNDLED_FILE), sha256_of(BUNDLED_INT8_FILE)}
+
+
+def test_rounded_to_eight_bits_it_sees_the_same_street(loaded):
+    scenario = load_scenario(bundled_folder() / "dense-pedestrian-group.yaml")
+    image, _ = ScenePainter(scenario, scene_camera(loaded, (1920, 1080))).draw(3.0)
+    found = []
+    for file in (BUNDLED_FILE, BUNDLED_INT8_FILE):
+        config = DetectionConfig(model=str(file), providers=("cpu",), confidence=0.3)
+        found.append(load_detector(config, file.parent).infer(image, 1920, 1080).detections)
+    assert min(len(one) for one in found) >= 5
+    for kind in Kind:
+        assert abs(*(np.diff([int((one.kind == kind).sum()) for one in found]))) <= 1
 
 
 def test_config_check_finds_it(capsys):

@@ -200,6 +200,17 @@ def test_random_draws_repeat_and_differ() -> None:
     assert kinds == set(SIZES_M)
 
 
+def test_as_many_e_scooters_as_asked_for() -> None:
+    def share(asked: float) -> float:
+        agents = [a for i in range(150) for a in random_scenario(i, asked).agents]
+        ridden = [a.size_m[0] == 1.2 for a in agents if a.kind == "cyclist"]
+        return sum(ridden) / len(ridden)
+
+    assert share(0.0) == 0.0
+    assert share(1.0) == 1.0
+    assert 0.35 < share(0.45) < 0.55
+
+
 def test_random_people_stand_near_and_far_and_still() -> None:
     away, still = [], 0
     for i in range(120):
