@@ -10,6 +10,7 @@ and edges, which are little work: a box is asked for to a part of a pixel.
 from __future__ import annotations
 
 import logging
+import re
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -26,9 +27,12 @@ from bikeped.types import Float32Array
 
 PICTURES = 64  #: are enough to take the steps from
 _INPUT = "images"
-_WITHIN = "/network/"  #: names of the network's own operations begin so, as `export` writes them
-_KEPT = ("/stem.0/", "/score/", "/edge/")
-_ROUNDED = ["Conv", "Relu", "Concat", "Add", "Slice", "Resize"]
+#: How the names of the operations begin that are rounded, as `export` writes them. Not the joining
+#: of the answers: edges would be rounded to a twentieth of a cell.
+_ROUNDED = re.compile(
+    r"/network/(stem/stem\.[12]/|stages\.|lateral\.|merge\.|heads\.\d+/trunk/|Resize|Add)"
+)
+_OPERATIONS = ["Conv", "Relu", "Concat", "Add", "Slice", "Resize"]
 
 
 def shown_pictures(data: CocoData, size: tuple[int, int], count: int) -> Iterator[Float32Array]:
@@ -69,11 +73,7 @@ def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
             return {_INPUT: picture}
 
     nodes = onnx.load(str(model)).graph.node
-    kept = [
-        node.name
-        for node in nodes
-        if not node.name.startswith(_WITHIN) or any(part in node.name for part in _KEPT)
-    ]
+    kept = [node.name for node in nodes if not _ROUNDED.match(node.name)]
     if len(kept) == len(nodes):
         raise DetectorError(f"{model}: is not the small network that `bikeped model export` writes")
     reader = Reader()
@@ -92,7 +92,7 @@ def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
                 weight_type=QuantType.QInt8,
                 per_channel=True,
                 reduce_range=True,
-                op_types_to_quantize=_ROUNDED,
+                op_types_to_quantize=_OPERATIONS,
                 nodes_to_exclude=kept,
             )
             content = file.read_bytes()
