@@ -45,7 +45,7 @@ from bikeped.training.crops import CropSettings
 from bikeped.training.drawn import DrawnSettings, draw_set
 from bikeped.training.export import export_network
 from bikeped.training.fit import FitSettings, fit, load_weights
-from bikeped.training.network import multiply_adds, shift_scores
+from bikeped.training.network import SmallNet, multiply_adds, shift_scores
 from bikeped.training.packing import PackSettings
 from bikeped.training.quantise import PICTURES as STEPS_FROM
 from bikeped.training.quantise import quantise, shown_pictures
@@ -191,7 +191,11 @@ def experiment(out: Path) -> None:
         order = AugmentSettings(WarpRanges(size_px=960), 0, 1, 0.3, 2)
         source = read_coco(folder / "ordinary")
         augment_data(source, folder / "augmented", order, counted("augmented", len(source.images)))
-    lines: dict[str, Any] = {"pictures": EXPERIMENT_PICTURES, "steps": EXPERIMENT_STEPS}
+    lines: dict[str, Any] = {
+        "pictures": EXPERIMENT_PICTURES,
+        "steps": EXPERIMENT_STEPS,
+        "weights": sum(p.numel() for p in SmallNet(len(Kind)).parameters()),
+    }
     for name, view in (("ordinary", (960, 544)), ("augmented", (960, 960))):
         model = folder / f"{name}.onnx"
         if not model.is_file():

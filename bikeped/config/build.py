@@ -40,9 +40,16 @@ def rule_settings(decision: DecisionConfig) -> RuleSettings:
 
 
 def tracker_settings(
-    tracking: TrackingConfig, nominal_fps: float = 30.0, acceleration: bool = False
+    tracking: TrackingConfig,
+    nominal_fps: float = 30.0,
+    acceleration: bool = False,
+    riders_whole: bool = False,
 ) -> TrackerSettings:
-    """The tracker's parameters; `acceleration` for second-order prediction."""
+    """The tracker's parameters; `acceleration` for second-order prediction.
+
+    `riders_whole`: the detector boxes rider and cycle as one, so nobody is to be joined to a cycle,
+    and a person who was once taken for a cyclist need not stay one.
+    """
     return TrackerSettings(
         match_radius_m=tracking.match_radius_m,
         max_unseen_s=tracking.max_unseen_s,
@@ -58,7 +65,7 @@ def tracker_settings(
         unbiased=True,
         acceleration=acceleration,
         max_range_m=tracking.max_range_m,
-        rider_radius_m=tracking.rider_radius_m,
+        rider_radius_m=0.0 if riders_whole else tracking.rider_radius_m,
     )
 
 

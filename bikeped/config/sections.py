@@ -291,7 +291,8 @@ class TrackingConfig(Section, frozen=True):
             ge=0,
             le=5,
             description="a person without a track, this near to a cyclist's track without a "
-            "detection, is that cyclist, and the reverse; 0: never, m",
+            "detection, is that cyclist, and the reverse; 0: never, as for a model whose cyclists "
+            "are boxed with their rider (the bundled one: always 0), m",
         ),
     ] = 1.0
     max_range_m: Annotated[

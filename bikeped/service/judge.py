@@ -21,6 +21,7 @@ from bikeped.config import (
 )
 from bikeped.decision import Decider
 from bikeped.geometry import Framing, GroundTable
+from bikeped.models import BUNDLED
 from bikeped.tracking import Tracker, predict
 from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 
@@ -53,7 +54,10 @@ class Judge:
             self.camera, *self.sensor_framing.crop_wh, step_px=config.camera.table_step_px
         )
         self._tracker_settings = tracker_settings(
-            config.tracking, fps, acceleration=config.latency.order == 2
+            config.tracking,
+            fps,
+            acceleration=config.latency.order == 2,
+            riders_whole=config.detection.model == BUNDLED,
         )
         self._speed_window_s = config.tracking.speed_window_frames / fps
         self._history = config.tracking.history_frames

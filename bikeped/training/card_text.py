@@ -209,7 +209,8 @@ def _row(ring: str, numbers: Mapping[str, Any]) -> str:
 
 def _experiment(experiment: Mapping[str, Any]) -> str:
     """The paper's effect in miniature."""
-    said = f"The same network, from scratch, {experiment['steps']} steps each on "
+    said = f"One network ({experiment['weights']:,} weights), from scratch, "
+    said += f"{experiment['steps']} steps each on "
     said += f"{experiment['pictures']} rectilinear drawings, and on those drawings warped by "
     said += "`bikeped model augment`; both measured on held-out drawn fisheye pictures "
     said += "(`scripts/train-detector --experiment`)."

@@ -89,7 +89,7 @@ def test_the_demo_end_to_end_in_short(tmp_path, capsys):
     assert main(["demo", "--seconds", "0.5", "--out", str(out), "--json", "-"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["frames"] == 15
-    assert "small.onnx" in summary["detector"]
+    assert "small-int8.onnx" in summary["detector"]
     assert "must not" in summary["notice"]
     assert "latency_ms" in summary
     assert len(validate_events(out / "events.jsonl")) == 15

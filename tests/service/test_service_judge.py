@@ -1,0 +1,30 @@
+"""The judge: from detections to a decision, as the pole and a replay have it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bikeped.config import load_config
+from bikeped.service.judge import Judge
+from bikeped.types import Detections, Kind
+
+
+def kinds_of_a_walker_first_taken_for_a_cyclist(judge: Judge) -> set[int]:
+    """What the tracks are called at the end: ten frames a cyclist, ten a pedestrian."""
+    box = np.array([[1880.0, 1500.0, 1960.0, 1800.0]], np.float32)
+    for frame in range(20):
+        kind = Kind.CYCLIST if frame < 10 else Kind.PEDESTRIAN
+        seen = Detections(np.array([kind], np.int8), np.array([0.9], np.float32), box)
+        judgement = judge.judge(seen, 3840, 2160, frame / 30, 0.0)
+        assert judgement.not_on_ground == 0
+    tracks = judgement.tracks
+    return {int(tracks.kind[i]) for i in range(len(tracks.kind))}
+
+
+@pytest.mark.parametrize(("model", "kind"), [("street.onnx", "cyclist"), ("bundled", "both")])
+def test_only_a_detector_that_loses_bicycles_keeps_a_person_on_one(model, kind):
+    judge = Judge(load_config(None, (f"detection.model={model}",)))
+    walker, rider = int(Kind.PEDESTRIAN), int(Kind.CYCLIST)
+    expected = {rider} if kind == "cyclist" else {walker, rider}
+    assert kinds_of_a_walker_first_taken_for_a_cyclist(judge) == expected
