@@ -24,6 +24,8 @@ _WELL = frozenset(get_args(ShownState)) - {"FAULT"}
 IDLE_S = 20.0
 #: How long the rest of a refused body is thrown away unread, so that the sender gets the answer.
 _LINGER_S = 0.5
+#: Turns of asyncio's loop from an accepted socket to its protocol's `connection_made`, and one more.
+_TURNS_TO_ACCEPT = 4
 _BACKLOG = 32
 
 
@@ -120,6 +122,8 @@ class HttpServer:
             self._server = None
         if runner is None or runner.server is None:
             return
+        for _ in range(_TURNS_TO_ACCEPT):  # who was being let in when the door closed is in now
+            await asyncio.sleep(0)
         connections = [c.transport for c in runner.server.connections if c.transport is not None]
         await runner.cleanup()
         for connection in connections:
