@@ -43,8 +43,8 @@ from bikeped.errors import DetectorError
     "--int8",
     type=click.Path(path_type=Path),
     metavar="DATA",
-    help="Round the small network to eight bits: about twice as quick on a processor without a "
-    "GPU. DATA: pictures in COCO's format that the steps are taken from.",
+    help="Round the small network to eight bits: quicker on a processor without a GPU. "
+    "DATA: pictures in COCO's format that the steps are taken from.",
 )
 @click.option("--full-precision", is_flag=True, help="An engine without 16-bit floats.")
 @click.option(

@@ -14,7 +14,7 @@ NOT_FOR_STREETS = (
     "the bundled model knows drawn streets only; it must not warn anybody on a real one"
 )
 BUNDLED_FILE = Path(__file__).with_name("small.onnx")
-#: The same network in eight bits, which a processor without a GPU answers in half of the time.
+#: The same network in eight bits, quicker on a processor.
 BUNDLED_INT8_FILE = Path(__file__).with_name("small-int8.onnx")
 
 

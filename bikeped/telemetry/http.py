@@ -24,7 +24,7 @@ _WELL = frozenset(get_args(ShownState)) - {"FAULT"}
 IDLE_S = 20.0
 #: How long the rest of a refused body is thrown away unread, so that the sender gets the answer.
 _LINGER_S = 0.5
-#: Turns of asyncio's loop from an accepted socket to `connection_made` of its protocol, and one more.
+#: Turns of asyncio's loop from an accepted socket to its `connection_made`, and one more.
 _TURNS_TO_ACCEPT = 4
 _BACKLOG = 32
 
