@@ -120,15 +120,18 @@ class HttpServer:
         if self._server is not None:
             self._server.close()
             self._server = None
-        if runner is None or runner.server is None:
+        accepting = None if runner is None else runner.server
+        if runner is None or accepting is None:
             return
         for _ in range(_TURNS_TO_ACCEPT):  # who was being let in when the door closed is in now
             await asyncio.sleep(0)
-        connections = [c.transport for c in runner.server.connections if c.transport is not None]
+        connections = [c.transport for c in accepting.connections if c.transport is not None]
         await runner.cleanup()
+        connections += [c.transport for c in accepting.connections if c.transport is not None]
         for connection in connections:
             connection.abort()
-        await asyncio.sleep(0)  # in which they are let go
+        for _ in range(_TURNS_TO_ACCEPT):  # in which they are let go
+            await asyncio.sleep(0)
 
 
 class _TurnAway(asyncio.Protocol):
