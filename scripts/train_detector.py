@@ -1,6 +1,6 @@
 """Our own small detector from nothing: draws streets, trains, measures, writes the card.
 
-    scripts/train-detector --out DIR              all of it, about an hour on two cores
+    scripts/train-detector --out DIR              all of it, an hour and a half on two cores
     scripts/train-detector --out DIR --ship       and puts model and card into the package
     scripts/train-detector --out DIR --experiment rectilinear against fisheye-augmented training
 
@@ -115,7 +115,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
     # is the one that most will run.
     whole = read_coco(data)
     export_network(network, names, SHOWN, out / "plain.onnx", facts)
-    quantise(out / "plain.onnx", shown_pictures(whole, SHOWN, STEPS_FROM), out / "plain-int8.onnx")
+    quantise(out / "plain.onnx", shown_pictures(whole, SHOWN), out / "plain-int8.onnx")
     plain = DetectionConfig(model=str((out / "plain-int8.onnx").resolve()), confidence=0.04)
     validation, _ = drawn_test(plain, loaded, VALIDATION, counted("validated", VALIDATION.pictures))
     chosen = [choose_confidence(validation, kind, GRID, MOST_FALSE[kind]) for kind in Kind]
@@ -123,7 +123,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
     shift_scores(network, chosen, shipped)
     exported = export_network(network, names, SHOWN, out / "small.onnx", facts)
     int8 = out / "small-int8.onnx"
-    int8_bytes = quantise(out / "small.onnx", shown_pictures(whole, SHOWN, STEPS_FROM), int8)
+    int8_bytes = quantise(out / "small.onnx", shown_pictures(whole, SHOWN), int8)
     models = {
         file: msgspec.structs.replace(loaded.config.detection, model=str((out / file).resolve()))
         for file in ("small.onnx", "small-int8.onnx")

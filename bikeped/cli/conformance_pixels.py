@@ -14,7 +14,7 @@ from bikeped.files import make_folder
 
 
 def _size(text: str) -> tuple[int, int]:
-    size = width_height(text)
+    size = width_height(text.lower())
     if size is not None and 160 <= size[0] <= 7680 and 90 <= size[1] <= 4320:
         return size
     raise BikepedError(f"--size {text}: give width x height in pixels, e.g. 1920x1080")

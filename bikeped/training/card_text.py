@@ -47,10 +47,11 @@ The input is RGB / 255, the picture centred on grey 114, with any sides that are
 {input} pixels for a whole frame ({macs:.2f} billion multiplications), {road} for the road of the
 configured camera ({road_macs:.2f}; `detection.region: auto` shows a camera's road and nothing
 else). The output is laid out as `yolov8`. In `{int8_file}` weights and what passes between layers
-are whole numbers of eight bits (weights: seven), their steps taken from {int8_pictures} of the
-pictures above; the first layer, scores and edges are not. The scores of each class are shifted so
-that the default `detection.confidence` of {confidence} is the one chosen for it on the validation
-pictures, where at most {most_false} a 100 frames were false{choice}; a score is no probability.
+are whole numbers of eight bits (weights: seven), their steps taken from about {int8_pictures} of
+the pictures above; the first layer, scores and edges are not. The scores of each class are shifted
+so that the default `detection.confidence` of {confidence} is the one chosen for it on the
+validation pictures, where at most {most_false} a 100 frames were false{choice}; a score is no
+probability.
 
 ## What it is worth
 

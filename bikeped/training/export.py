@@ -172,10 +172,10 @@ def export_any(weights: Path, out: Path, size: int, int8: Path | None = None) ->
 
 def _in_int8(weights: Path, out: Path, data: Path) -> ExportSummary:
     from bikeped.training.coco import read_coco
-    from bikeped.training.quantise import PICTURES, quantise, shown_pictures
+    from bikeped.training.quantise import quantise, shown_pictures
 
     pictures = read_coco(data)
     with tempfile.TemporaryDirectory() as folder:
         summary = export_weights(weights, Path(folder) / "float.onnx")
-        shown = shown_pictures(pictures, summary.size, PICTURES)
+        shown = shown_pictures(pictures, summary.size)
         return replace(summary, path=out, bytes=quantise(summary.path, shown, out))

@@ -35,7 +35,9 @@ _ROUNDED = re.compile(
 _OPERATIONS = ["Conv", "Relu", "Concat", "Add", "Slice", "Resize"]
 
 
-def shown_pictures(data: CocoData, size: tuple[int, int], count: int) -> Iterator[Float32Array]:
+def shown_pictures(
+    data: CocoData, size: tuple[int, int], count: int = PICTURES
+) -> Iterator[Float32Array]:
     """About `count` pictures of `data`, evenly spread, as a network of input `size` (width, height)
     is shown them: [1, 3, h, w], 0..1. Raises DataSetError for one that cannot be read."""
     width, height = size
