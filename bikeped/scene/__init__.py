@@ -9,7 +9,7 @@ from bikeped.scene.camera import (
     rectilinear_camera,
     scene_camera,
 )
-from bikeped.scene.chance import random_camera, random_scenario
+from bikeped.scene.chance import Mix, random_camera, random_scenario
 from bikeped.scene.clip import ClipTruth, read_sidecar, sidecar_path, write_clip
 from bikeped.scene.conditions import LIGHTS, WEATHERS, Conditions, random_conditions
 from bikeped.scene.dataset import pictures, write_dataset
@@ -24,6 +24,7 @@ __all__ = [
     "ClipTruth",
     "Conditions",
     "DrawnObject",
+    "Mix",
     "SceneCamera",
     "ScenePainter",
     "lens_camera",

@@ -54,7 +54,11 @@ class Backdrop:
 @lru_cache(maxsize=2)
 def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
     """The backdrop; the last two are kept, for scenarios that share one."""
-    light, where, ray = lighting(conditions), place(conditions.place), rays(view)
+    light, where, ray = (
+        lighting(conditions),
+        place(conditions.place, conditions.clutter),
+        rays(view),
+    )
     canvas = _sky(ray, light, conditions)
     _ground(canvas, ray, view, where, light)
     image = np.clip(canvas, 0, 255).astype(np.uint8)

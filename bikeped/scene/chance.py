@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,15 +16,22 @@ _DURATION_S = 6.0
 _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
 
-#: Share of e-scooters among cyclists.
-SCOOTERS = 0.25
+@dataclass(frozen=True)
+class Mix:
+    """How much there is of what is rare and hard to tell, in random scenarios and streets."""
+
+    scooters: float = 0.25  #: share of e-scooters among the cyclists
+    wheelchairs: float = 0.1  #: share of wheelchair users among the pedestrians
+    beside: float = 0.25  #: share of the pedestrians who stand close to somebody
+    clutter: int = 0  #: a street has up to this many more bollards, bins and signs near the camera
 
 
-def random_scenario(seed: int, scooters: float = SCOOTERS) -> Scenario:
+USUAL_MIX = Mix()
+
+
+def random_scenario(seed: int, mix: Mix = USUAL_MIX) -> Scenario:
     """A scenario of 6 s: walkers, children, wheelchairs, cyclists, e-scooters and vehicles, none to
     a crowd, 1.5 to 40 m before the usual camera, in all directions, some standing still.
-
-    `scooters`: the share of e-scooters among the cyclists.
     """
     rng = np.random.default_rng((seed, 41))
     busy = float(rng.choice([0.3, 1.0, 1.8]))
@@ -62,12 +70,12 @@ def random_scenario(seed: int, scooters: float = SCOOTERS) -> Scenario:
         if draw < 0.15:
             tall = float(rng.uniform(0.95, 1.35))
             size = (0.26, 0.36, tall)
-        elif draw < 0.25:
+        elif draw < 0.15 + mix.wheelchairs:
             size = (1.1, 0.65, 1.3)
         speed = 0.0 if rng.random() < 0.3 else float(rng.uniform(0.6, 1.8))
-        add("pedestrian", size, speed, 0.8 if rng.random() < 0.25 else 0.0)
+        add("pedestrian", size, speed, 0.8 if rng.random() < mix.beside else 0.0)
     for _ in range(int(rng.poisson(2.6 * busy))):
-        size = varied("cyclist", 0.05) if rng.random() >= scooters else (1.2, 0.5, 1.75)
+        size = varied("cyclist", 0.05) if rng.random() >= mix.scooters else (1.2, 0.5, 1.75)
         speed = 0.0 if rng.random() < 0.12 else float(rng.uniform(2.0, 9.0))
         add("cyclist", size, speed, 1.2 if rng.random() < 0.15 else 0.0)
     for _ in range(int(rng.poisson(0.9 * busy))):

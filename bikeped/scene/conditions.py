@@ -21,7 +21,8 @@ class Conditions:
     `seed`: clothes, paints, noise. `light`: day, overcast, dusk, night, glare. `weather`: dry,
     rain. `place`: road layout, houses, textures and occluders (poles, trees, parked cars); 0 is
     the plain street of the bundled scenarios. `noise`: standard deviation of the sensor's noise in
-    grey levels by day; darkness raises it.
+    grey levels by day; darkness raises it. `clutter`: this many more bollards, bins, signs and
+    hydrants near the usual camera's place than the place has.
     """
 
     seed: int = 0
@@ -29,6 +30,7 @@ class Conditions:
     weather: str = "dry"
     place: int = 0
     noise: float = 2.5
+    clutter: int = 0
 
     def __post_init__(self) -> None:
         if self.light not in LIGHTS:
@@ -37,8 +39,8 @@ class Conditions:
             raise ScenarioError(f"weather: {self.weather!r} is not one of {', '.join(WEATHERS)}")
         if not 0 <= self.noise <= 40:
             raise ScenarioError(f"noise: {self.noise} is not 0 to 40 grey levels")
-        if self.seed < 0 or self.place < 0:
-            raise ScenarioError("seed, place: must not be negative")
+        if min(self.seed, self.place, self.clutter) < 0:
+            raise ScenarioError("seed, place, clutter: must not be negative")
 
 
 @dataclass(frozen=True)
@@ -137,8 +139,9 @@ def lighting(conditions: Conditions) -> Lighting:
     )
 
 
-def random_conditions(seed: int) -> Conditions:
-    """Conditions for training: every light, weather and place, noise from clean to grainy."""
+def random_conditions(seed: int, clutter: int = 0) -> Conditions:
+    """Conditions for training: every light, weather and place, noise from clean to grainy, and up
+    to `clutter` more things near the camera."""
     rng = np.random.default_rng((seed, 23))
     return Conditions(
         seed=int(rng.integers(1 << 30)),
@@ -146,4 +149,5 @@ def random_conditions(seed: int) -> Conditions:
         weather="rain" if rng.random() < 0.18 else "dry",
         place=int(rng.integers(1 << 30)),
         noise=float(round(rng.uniform(0.5, 5.0), 2)),
+        clutter=int(rng.integers(clutter + 1)),
     )

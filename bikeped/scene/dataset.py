@@ -15,7 +15,7 @@ import numpy as np
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder
 from bikeped.scene.camera import SceneCamera
-from bikeped.scene.chance import SCOOTERS, random_camera, random_scenario
+from bikeped.scene.chance import USUAL_MIX, Mix, random_camera, random_scenario
 from bikeped.scene.clip import encode_jpeg
 from bikeped.scene.conditions import Conditions, random_conditions
 from bikeped.scene.labels import DrawnObject
@@ -48,22 +48,20 @@ def pictures(
     *,
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
-    scooters: float = SCOOTERS,
+    mix: Mix = USUAL_MIX,
 ) -> Iterator[DrawnPicture]:
     """`count` drawn pictures with their objects: random scenarios, lights, weathers and places.
 
     `camera`: for all of them; None draws a camera for every street (`lens`: fisheye or
-    rectilinear). `scooters`: as `random_scenario` has it. Equal arguments give equal pictures; a
+    rectilinear). `mix`: of who and what is there. Equal arguments give equal pictures; a
     larger `count` begins with the same ones.
     """
     for number in range(count):
         street = seed * 1_000_003 + number // _PER_STREET
-        conditions = random_conditions(street)
+        conditions = random_conditions(street, mix.clutter)
         view = camera or random_camera(street, size, lens)
         rng = np.random.default_rng((seed, number, 59))
-        painter = ScenePainter(
-            random_scenario(seed * 1_000_003 + number, scooters), view, conditions
-        )
+        painter = ScenePainter(random_scenario(seed * 1_000_003 + number, mix), view, conditions)
         image, objects = painter.draw(float(rng.uniform(0.2, 5.8)))
         yield DrawnPicture(image, objects, conditions, view, painter.furniture())
 
@@ -76,7 +74,7 @@ def write_dataset(
     *,
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
-    scooters: float = SCOOTERS,
+    mix: Mix = USUAL_MIX,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Writes `folder`/images/*.jpg and `folder`/annotations.json; returns the latter.
@@ -104,7 +102,7 @@ def write_dataset(
         (partial / "images").mkdir()
         images: list[dict[str, Any]] = []
         notes: list[dict[str, Any]] = []
-        drawn = pictures(count, seed, camera, size=size, lens=lens, scooters=scooters)
+        drawn = pictures(count, seed, camera, size=size, lens=lens, mix=mix)
         for number, one in enumerate(drawn):
             name = f"{number:06d}.jpg"
             quality = 78 + (seed * 7 + number * 5) % 18

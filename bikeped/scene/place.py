@@ -67,8 +67,8 @@ _WALLS: tuple[Rgb, ...] = (
 )  # fmt: skip
 
 
-def place(number: int) -> Place:
-    """The place of this number; the same number is always the same place."""
+def place(number: int, clutter: int = 0) -> Place:
+    """The place of this number, the same each time, with `clutter` more things near the camera."""
     rng = np.random.default_rng((number, 5))
     usual = number == 0
     kerb = 6.1 if usual else float(rng.uniform(4.9, 8.0))
@@ -110,7 +110,7 @@ def place(number: int) -> Place:
         slab_m=0.9 if usual else float(rng.choice([0.5, 0.75, 1.2, 1.5])),
         yellow_centre=usual or bool(rng.random() < 0.5),
         houses=_houses(rng, kerb + walk, side),
-        fixtures=_fixtures(rng, usual, kerb, walk, side, cross),
+        fixtures=_fixtures(rng, usual, kerb, walk, side, cross) + _clutter(number, clutter, kerb),
     )
 
 
@@ -190,3 +190,17 @@ def _fixtures(
     for x, way in parked:
         put("car", x, way * (kerb - 1.05), 0.0 if way < 0 else np.pi)
     return tuple(out)
+
+
+def _clutter(number: int, count: int, kerb: float) -> tuple[Fixture, ...]:
+    """Things of a person's size on the sidewalk below the usual camera."""
+    rng = np.random.default_rng((number, 97))
+    return tuple(
+        Fixture(
+            str(rng.choice(["bollard", "bin", "sign", "hydrant"], p=[0.36, 0.3, 0.24, 0.1])),
+            (CROSSING_X_M + float(rng.uniform(-9, 9)), float(rng.uniform(-12.0, -kerb - 0.5))),
+            float(rng.uniform(-3, 3)),
+            int(rng.integers(1 << 20)),
+        )
+        for _ in range(count)
+    )

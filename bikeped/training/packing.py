@@ -32,7 +32,7 @@ class PackSettings:
     empty: float = 0.08  #: share of windows where some other picture has an object
     #: Share of windows around signs, bollards and other things that are nobody, where the data
     #: tell of them: they are what is taken for somebody.
-    furniture: float = 0.14
+    furniture: float = 0.18
     room: float = 1.25  #: side of a window, in longest sides of its object
     #: How often objects that need 1, 2, 3, 4 blocks are taken: the largest are the easiest.
     taken: tuple[float, ...] = (1.0, 1.0, 0.85, 0.65)

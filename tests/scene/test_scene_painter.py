@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from bikeped.geometry import Lens
 from bikeped.scene import (
     LIGHTS,
     Conditions,
+    Mix,
     SceneCamera,
     ScenePainter,
     lens_camera,
@@ -25,6 +27,7 @@ from bikeped.scene import (
 )
 from bikeped.scene.backdrop import backdrop
 from bikeped.scene.camera import rays
+from bikeped.scene.place import place
 from bikeped.types import ImageArray
 
 SIZE = (320, 180)
@@ -200,15 +203,30 @@ def test_random_draws_repeat_and_differ() -> None:
     assert kinds == set(SIZES_M)
 
 
-def test_as_many_e_scooters_as_asked_for() -> None:
-    def share(asked: float) -> float:
-        agents = [a for i in range(150) for a in random_scenario(i, asked).agents]
-        ridden = [a.size_m[0] == 1.2 for a in agents if a.kind == "cyclist"]
-        return sum(ridden) / len(ridden)
+def test_as_many_e_scooters_and_wheelchairs_as_asked_for() -> None:
+    def share(kind: str, length_m: float, mix: Mix) -> float:
+        agents = [a for i in range(150) for a in random_scenario(i, mix).agents]
+        found = [a.size_m[0] == length_m for a in agents if a.kind == kind]
+        return sum(found) / len(found)
 
-    assert share(0.0) == 0.0
-    assert share(1.0) == 1.0
-    assert 0.35 < share(0.45) < 0.55
+    assert share("cyclist", 1.2, Mix(scooters=0.0)) == 0.0
+    assert share("cyclist", 1.2, Mix(scooters=1.0)) == 1.0
+    assert 0.35 < share("cyclist", 1.2, Mix(scooters=0.45)) < 0.55
+    assert share("pedestrian", 1.1, Mix(wheelchairs=0.0)) == 0.0
+    assert 0.25 < share("pedestrian", 1.1, Mix(wheelchairs=0.3)) < 0.35
+
+
+def test_clutter_adds_things_near_the_camera_and_leaves_the_rest() -> None:
+    plain, full = place(7), place(7, 5)
+    assert full.fixtures[: len(plain.fixtures)] == plain.fixtures
+    more = full.fixtures[len(plain.fixtures) :]
+    assert len(more) == 5
+    assert {item.what for item in more} <= {"bollard", "bin", "sign", "hydrant"}
+    assert all(-4 <= item.xy_m[0] <= 14 and item.xy_m[1] < -plain.kerb for item in more)
+    assert {random_conditions(i, 3).clutter for i in range(40)} == {0, 1, 2, 3}
+    assert random_conditions(5, 3) == replace(
+        random_conditions(5), clutter=random_conditions(5, 3).clutter
+    )
 
 
 def test_random_people_stand_near_and_far_and_still() -> None:
