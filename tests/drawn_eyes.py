@@ -19,6 +19,7 @@ class OracleEye:
 
     name = "oracle"
     model_hash: str | None = None
+    riders_whole = True
 
     def __init__(self, of: Callable[[int], Detections]) -> None:
         self._of = of

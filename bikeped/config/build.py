@@ -47,8 +47,7 @@ def tracker_settings(
 ) -> TrackerSettings:
     """The tracker's parameters; `acceleration` for second-order prediction.
 
-    `riders_whole`: the detector boxes rider and cycle as one, so nobody is to be joined to a cycle,
-    and a person who was once taken for a cyclist need not stay one.
+    `riders_whole`: as `TrackerSettings` has it.
     """
     return TrackerSettings(
         match_radius_m=tracking.match_radius_m,
@@ -65,7 +64,8 @@ def tracker_settings(
         unbiased=True,
         acceleration=acceleration,
         max_range_m=tracking.max_range_m,
-        rider_radius_m=0.0 if riders_whole else tracking.rider_radius_m,
+        rider_radius_m=tracking.rider_radius_m,
+        riders_whole=riders_whole,
     )
 
 

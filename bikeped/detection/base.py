@@ -43,6 +43,11 @@ class Detector(Protocol):
         """Width and height of the network's input, pixels."""
         ...
 
+    @property
+    def riders_whole(self) -> bool:
+        """Whether a cyclist's box holds the rider, too, who is then no pedestrian beside it."""
+        ...
+
     def decode_size(self, frame_width: int, frame_height: int) -> tuple[int, int]:
         """Least width and height of picture that loses nothing against the full frame.
 

@@ -137,6 +137,11 @@ class NetworkDetector:
         return self._size
 
     @property
+    def riders_whole(self) -> bool:
+        """Whether a cyclist's box holds the rider, too, by the names of the model's classes."""
+        return self._whole
+
+    @property
     def layout(self) -> Layout:
         """The output layout in use."""
         return self._layout

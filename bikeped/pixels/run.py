@@ -37,6 +37,7 @@ class PixelRun:
     height: int
     detector: str
     model_hash: str | None
+    riders_whole: bool  #: as the detector has it
 
 
 class _Kept:
@@ -63,12 +64,14 @@ def run_scenario(
     painter = ScenePainter(scenario, scene_camera(loaded, size), conditions)
     source = DrawnSource(painter, scenario.name, scenario.frame_times(FPS).tolist(), FPS)
     kept = _Kept()
+    judge = Judge(loaded)
+    judge.expect(riders_whole=looking.riders_whole)
 
     async def through() -> None:
         loop = Loop(
             feed=RecordedFeed(source),
             vision=Vision(looking),
-            judge=Judge(loaded),
+            judge=judge,
             announcer=Announcer(SignalLogic.from_config(loaded.config.feedback)),
             outputs=[kept],
         )
@@ -84,6 +87,7 @@ def run_scenario(
         height=size[1],
         detector=looking.name,
         model_hash=looking.model_hash,
+        riders_whole=looking.riders_whole,
     )
 
 

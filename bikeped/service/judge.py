@@ -21,7 +21,6 @@ from bikeped.config import (
 )
 from bikeped.decision import Decider
 from bikeped.geometry import Framing, GroundTable
-from bikeped.models import BUNDLED
 from bikeped.tracking import Tracker, predict
 from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 
@@ -48,16 +47,11 @@ class Judge:
     def __init__(self, loaded: LoadedConfig) -> None:
         config = loaded.config
         fps = config.decision.nominal_fps
+        self._config, self._fps = config, fps
         self.sensor_framing = framing(loaded)
         self.camera = ground_camera(loaded)
         self.table = GroundTable(
             self.camera, *self.sensor_framing.crop_wh, step_px=config.camera.table_step_px
-        )
-        self._tracker_settings = tracker_settings(
-            config.tracking,
-            fps,
-            acceleration=config.latency.order == 2,
-            riders_whole=config.detection.model == BUNDLED,
         )
         self._speed_window_s = config.tracking.speed_window_frames / fps
         self._history = config.tracking.history_frames
@@ -66,6 +60,16 @@ class Judge:
         self._latency = config.latency
         self._fixed_ahead_s = config.latency.frames / fps
         self._framings: dict[tuple[int, int], Framing] = {}
+        self.expect(riders_whole=False)
+
+    def expect(self, *, riders_whole: bool) -> None:
+        """Gets ready for another detector: whether it boxes rider and cycle as one. Resets."""
+        self._tracker_settings = tracker_settings(
+            self._config.tracking,
+            self._fps,
+            acceleration=self._config.latency.order == 2,
+            riders_whole=riders_whole,
+        )
         self.reset()
 
     def reset(self) -> None:

@@ -39,6 +39,10 @@ RESTART_AFTER_S = 5.0
 _WEIGHT = 0.2  #: of the newest duration in the usual one
 
 
+#: A picture, and what the eye will have said of it; None where it could not be looked at.
+_Look = tuple[Picture, "asyncio.Task[DetectorAnswer | None]"]
+
+
 class Hung(Exception):  # noqa: N818  a state to leave, not an error of the user's
     """A thread that cannot be ended does not return: only a new process helps."""
 
@@ -216,13 +220,30 @@ class Loop:
             await asyncio.sleep(min(max(free_s - ahead_s - time.perf_counter(), 0.0), 0.2))
 
     async def _look(self, slot: _Slot, worker: Worker) -> None:
-        while True:
-            picture = await slot.take()
-            if picture is None:
-                return
-            answer = await self._answer(picture, worker)
-            if answer is not None:
-                await self._finish(picture, answer)
+        following: _Look | None = None
+        try:
+            while True:
+                if following is None:
+                    picture = await slot.take()
+                    if picture is None:
+                        return
+                    following = self._begin(picture, worker)
+                picture, answering = following
+                answer = await answering
+                # What waits already is looked at while this one is judged: the eye is the slowest.
+                waiting = slot.take_waiting()
+                following = None if waiting is None else self._begin(waiting, worker)
+                if following is not None:
+                    await asyncio.sleep(0)  # the eye begins
+                if answer is not None:
+                    await self._finish(picture, answer)
+        finally:
+            if following is not None:
+                following[1].cancel()
+                await asyncio.gather(following[1], return_exceptions=True)
+
+    def _begin(self, picture: Picture, worker: Worker) -> _Look:
+        return picture, asyncio.create_task(self._answer(picture, worker), name="answer")
 
     async def _answer(self, picture: Picture, worker: Worker) -> DetectorAnswer | None:
         """What the eye says of a picture; None when a live one cannot be looked at."""
@@ -377,9 +398,16 @@ class _Slot:
         self._empty.clear()
         self._filled.set()
 
+    def take_waiting(self) -> Picture | None:
+        """The picture that is there now, if there is one; the end stays where it is."""
+        return None if self._item is None else self._take()
+
     async def take(self) -> Picture | None:
         """The picture, as soon as there is one."""
         await self._filled.wait()
+        return self._take()
+
+    def _take(self) -> Picture | None:
         item, self._item = self._item, None
         self._filled.clear()
         self._empty.set()

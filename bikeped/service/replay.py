@@ -115,6 +115,7 @@ def replay(
             raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
         warnings = [] if eye is not None else _size_warnings(loaded, source)
         looking = eye if eye is not None else load_eye(loaded)
+        judge.expect(riders_whole=looking.riders_whole)
         return asyncio.run(
             _replay(
                 loaded,

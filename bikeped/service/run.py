@@ -80,6 +80,7 @@ async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> in
         if eye is None:
             return 0
         log.info("detector: %s, sha256 %s", eye.name, eye.model_hash or "none")
+        judge.expect(riders_whole=eye.riders_whole)
         if loaded.config.detection.model == BUNDLED:
             log.warning("detection.model: %s", NOT_FOR_STREETS)
         async with contextlib.AsyncExitStack() as stack:

@@ -10,8 +10,8 @@ from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.base import Detector, DetectorAnswer
 from bikeped.types import Frame, ImageArray
 
-#: Pictures in use at once: one being decoded, one waiting, one looked at, one being drawn.
-PICTURES = 5
+#: Pictures in use at once: being decoded, waiting, looked at, judged, and being drawn.
+PICTURES = 6
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Eye(Protocol):
 
     name: str
     model_hash: str | None
+    riders_whole: bool  #: whether a cyclist's box holds the rider, too
 
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         """Least picture size that it needs of a frame of this size."""
@@ -45,6 +46,7 @@ class ModelEye:
         self._detector = detector
         self.name = detector.name
         self.model_hash: str | None = detector.model_hash
+        self.riders_whole = detector.riders_whole
 
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return self._detector.decode_size(width, height)

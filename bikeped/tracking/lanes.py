@@ -19,9 +19,13 @@ from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
 _EPSILON_S = 1e-6
 _PEDESTRIAN, _CYCLIST, _VEHICLE = (int(k) for k in (Kind.PEDESTRIAN, Kind.CYCLIST, Kind.VEHICLE))
 #: How a track's kind follows its detections (see `TrackerSettings.rider_radius_m`): the share of
-#: cycles among the recent ones, smoothed with this weight; two cycles in a row make a cyclist, 0.7
-#: to 2.3 s of mere persons a pedestrian again.
-_CYCLE_WEIGHT, _CYCLE_ON, _CYCLE_OFF = 0.08, 0.12, 0.03
+#: cycles among the recent ones, smoothed with this weight: over 0.4 s at 30 frames/s.
+_CYCLE_WEIGHT = 0.08
+#: Above the first share a pedestrian becomes a cyclist, below the second the reverse. Where a
+#: bicycle is easily missed, two in a row make a cyclist, and 0.7 to 2.3 s of mere persons a
+#: pedestrian again; where rider and cycle are one box, the most frequent kind is the right one.
+_CYCLE_SHARES = (0.12, 0.03)
+_WHOLE_SHARES = (0.55, 0.45)
 #: A cyclist unseen for longer is not a rider's any more.
 _RIDER_UNSEEN_S = 1.0
 #: A track that is not yet confirmed is dropped when unseen for longer than this.
@@ -42,8 +46,10 @@ class TrackerSettings:
     `rider_radius_m`: detectors see a small bicycle in some frames and only its rider in others. A
     person without a track, this near to a cyclist's track without a detection, is that cyclist (and
     the reverse), so that one rider does not become a cyclist and a pedestrian who meet. 0: never,
-    as in the paper's simulation, whose agents have one kind. `acceleration`: whether it is
-    estimated; only second-order prediction reads it.
+    as in the paper's simulation, whose agents have one kind. `riders_whole`: the detector boxes
+    rider and cycle as one, so either kind says as much as the other: a track is what most of its
+    detections were lately. `acceleration`: whether it is estimated; only second-order prediction
+    reads it.
     """
 
     match_radius_m: float = 3.0
@@ -56,6 +62,7 @@ class TrackerSettings:
     unbiased: bool = False
     max_range_m: float = math.inf
     rider_radius_m: float = 0.0
+    riders_whole: bool = False
     acceleration: bool = True
 
 
@@ -230,12 +237,16 @@ class LaneTracker:
         share, kind = self._cycle_share.reshape(-1), self.kind.reshape(-1)
         if not np.count_nonzero(share[flat] != (seen == _CYCLIST)):
             return  # seen as they were always seen
-        share[flat] += _CYCLE_WEIGHT * ((seen == _CYCLIST) - share[flat])
-        was = kind[flat]
-        kind[flat] = np.where((was == _PEDESTRIAN) & (share[flat] > _CYCLE_ON), _CYCLIST, was)
-        kind[flat] = np.where(
-            (was == _CYCLIST) & (share[flat] < _CYCLE_OFF), _PEDESTRIAN, kind[flat]
+        whole = self.settings.riders_whole
+        # A young track has no past to hold against what it is seen as: all of its sights count.
+        weight = np.maximum(_CYCLE_WEIGHT, 1 / self.hits.reshape(-1)[flat]) if whole else None
+        share[flat] += (_CYCLE_WEIGHT if weight is None else weight) * (
+            (seen == _CYCLIST) - share[flat]
         )
+        on, off = _WHOLE_SHARES if whole else _CYCLE_SHARES
+        was = kind[flat]
+        kind[flat] = np.where((was == _PEDESTRIAN) & (share[flat] > on), _CYCLIST, was)
+        kind[flat] = np.where((was == _CYCLIST) & (share[flat] < off), _PEDESTRIAN, kind[flat])
 
     def _drop(self, time_s: float) -> None:
         unseen = time_s - self.seen_s

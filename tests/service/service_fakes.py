@@ -99,6 +99,7 @@ class FakeEye:
 
     name = "fake"
     model_hash: str | None = None
+    riders_whole = False
 
     def __init__(self, answer: Detections | None = None) -> None:
         self.answer = Detections.empty() if answer is None else answer

@@ -9,6 +9,8 @@ from bikeped.config import load_config
 from bikeped.service.judge import Judge
 from bikeped.types import Detections, Kind
 
+P, C = Kind.PEDESTRIAN, Kind.CYCLIST
+
 
 def kinds_of_a_walker_first_taken_for_a_cyclist(judge: Judge) -> set[int]:
     """What the tracks are called at the end: ten frames a cyclist, ten a pedestrian."""
@@ -22,10 +24,17 @@ def kinds_of_a_walker_first_taken_for_a_cyclist(judge: Judge) -> set[int]:
     return {int(tracks.kind[i]) for i in range(len(tracks.kind))}
 
 
-@pytest.mark.parametrize(
-    ("model", "expected"),
-    [("street.onnx", {Kind.CYCLIST}), ("bundled", {Kind.PEDESTRIAN, Kind.CYCLIST})],
-)
-def test_only_a_detector_that_loses_bicycles_keeps_a_person_on_one(model, expected):
-    judge = Judge(load_config(None, (f"detection.model={model}",)))
-    assert kinds_of_a_walker_first_taken_for_a_cyclist(judge) == expected
+@pytest.mark.parametrize(("riders_whole", "expected"), [(False, C), (True, P)])
+def test_only_where_bicycles_are_easily_missed_a_person_stays_on_one(riders_whole, expected):
+    judge = Judge(load_config(None))
+    for _ in range(2):  # nothing of the first round is left in the second
+        judge.expect(riders_whole=riders_whole)
+        assert kinds_of_a_walker_first_taken_for_a_cyclist(judge) == {expected}
+
+
+def test_another_detector_forgets_what_the_first_one_saw():
+    judge = Judge(load_config(None))
+    kinds_of_a_walker_first_taken_for_a_cyclist(judge)
+    judge.expect(riders_whole=True)
+    tracks = judge.judge(Detections.empty(), 3840, 2160, 0.0, 0.0).tracks
+    assert len(tracks) == 0

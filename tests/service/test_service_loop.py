@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from service_fakes import PATIENCE_S, Rig, seen, small
+from service_fakes import PATIENCE_S, FakeEye, Rig, seen, small
 
 from bikeped.errors import CaptureError, DetectorError, GeometryError
-from bikeped.service.loop import RESTART_AFTER_S, Hung, Limits
+from bikeped.service.loop import RESTART_AFTER_S, Hung, Limits, Outcome
 from bikeped.types import Colour, Kind
 
 REASSURING = {Colour.BLUE, Colour.GREEN}
@@ -269,6 +269,71 @@ async def test_a_recording_ends_the_loop_after_its_last_frame():
         await rig.ended()
         assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(10))
         assert rig.recorder.ticks == 0  # a recording is not late
+
+
+class Meanwhile:
+    """Takes an outcome only when the eye has begun with the next frame."""
+
+    def __init__(self, eye: FakeEye, last: int) -> None:
+        self.eye, self.last = eye, last
+        self.numbers: list[int] = []
+
+    async def frame(self, outcome: Outcome) -> None:
+        number = outcome.picture.frame.number
+        self.numbers.append(number)
+        deadline = asyncio.get_running_loop().time() + PATIENCE_S
+        while number < self.last and self.eye.looks < number + 2:
+            assert asyncio.get_running_loop().time() < deadline
+            await asyncio.sleep(0)
+
+
+async def test_what_waits_is_looked_at_while_a_frame_is_judged():
+    rig = Rig(live=False)
+    output = Meanwhile(rig.eye, last=9)
+    rig.outputs.append(output)
+    for n in range(10):
+        rig.feed.put(n / 30)
+    rig.feed.queue.put_nowait(None)
+    async with rig:
+        await rig.ended()
+    assert output.numbers == list(range(10))
+
+
+async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
+    rig = Rig(live=False)
+    judged: list[int] = []
+
+    class Output:
+        async def frame(self, outcome: Outcome) -> None:
+            judged.append(outcome.picture.frame.number)
+            if len(judged) == 3:
+                rig.eye.error = DetectorError("out of memory")
+
+    rig.outputs.append(Output())
+    for n in range(10):
+        rig.feed.put(n / 30)
+    async with rig:
+        with pytest.raises(DetectorError, match="out of memory"):
+            await rig.ended()
+    assert judged in ([0, 1, 2], [0, 1, 2, 3])  # the look after the third may have begun already
+    assert rig.light.shown[-1].name == "OFF"
+
+
+async def test_an_output_that_fails_while_the_eye_hangs_ends_a_replay():
+    rig = Rig(live=False)
+
+    class Output:
+        async def frame(self, outcome: Outcome) -> None:
+            rig.eye.go.clear()
+            raise OSError("disk is full")
+
+    rig.outputs.append(Output())
+    for n in range(4):
+        rig.feed.put(n / 30)
+    async with rig:
+        with pytest.raises(OSError, match="disk is full"):
+            await rig.ended()
+    assert rig.light.shown[-1].name == "OFF"
 
 
 async def test_the_newest_decision_reaches_listeners_with_its_own_pair():

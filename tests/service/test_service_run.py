@@ -178,7 +178,7 @@ from bikeped.types import Detections
 import bikeped.service.run as run
 
 class Eye:
-    name, model_hash, looks = "hangs", None, 0
+    name, model_hash, riders_whole, looks = "hangs", None, False, 0
     def decode_size(self, width, height):
         return width, height
     def see(self, picture):

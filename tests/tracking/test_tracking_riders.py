@@ -1,8 +1,11 @@
-"""A detector that sees a small bicycle only now and then: one rider, one track, one kind."""
+"""One rider, one track, one kind, whether the detector often misses the bicycle or boxes both."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from bikeped.tracking import LaneTracker, TrackerSettings
 from bikeped.types import Kind
@@ -16,6 +19,8 @@ SETTINGS = TrackerSettings(
     unbiased=True,
     rider_radius_m=1.0,
 )
+#: Of a detector that boxes rider and cycle as one.
+WHOLE = replace(SETTINGS, riders_whole=True)
 
 
 def feed(tracker: LaneTracker, frame: int, *detections: tuple[int, float, float]) -> None:
@@ -81,3 +86,35 @@ def test_vehicles_and_the_simulation_are_left_alone():
             feed(tracker, frame, (first, 0.0, 5.0))
         feed(tracker, 5, (then, 0.2, 5.0))
         assert kinds(tracker) == {1: first, 2: then}
+
+
+@pytest.mark.parametrize("wrong_frames", [1, 3, 10])
+def test_where_riders_are_whole_a_walker_first_taken_for_a_cyclist_is_soon_a_walker(wrong_frames):
+    tracker = LaneTracker(WHOLE)
+    wrong = 0
+    for frame in range(60):
+        kind = C if frame < wrong_frames else P
+        feed(tracker, frame, (kind, 1.3 * frame / 30, 5.0))
+        assert len(kinds(tracker)) == 1  # and there is no ghost of a cyclist
+        wrong += kinds(tracker) == {1: C}
+    assert kinds(tracker) == {1: P}
+    assert wrong <= 2 * wrong_frames + 1
+
+
+def test_where_riders_are_whole_the_most_frequent_kind_is_the_tracks():
+    for share, expected in ((0.2, P), (0.8, C)):
+        rng = np.random.default_rng(5)
+        tracker = LaneTracker(WHOLE)
+        called = []
+        for frame in range(200):
+            feed(tracker, frame, (C if rng.random() < share else P, 3.0 * frame / 30, 5.0))
+            called += kinds(tracker).values()
+        assert called[30:] == [expected] * 170
+        assert len(called) == 200
+
+
+def test_where_riders_are_whole_two_people_stay_two():
+    tracker = LaneTracker(WHOLE)
+    for frame in range(30):
+        feed(tracker, frame, (C, 0.0, 5.0), (P, 0.6, 5.0))
+    assert sorted(kinds(tracker).values()) == [P, C]

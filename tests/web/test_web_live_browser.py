@@ -57,6 +57,7 @@ class SlowEye:
     def __init__(self, clip: Path) -> None:
         self._eye = clip_eye(sidecar_path(clip))
         self.name, self.model_hash = self._eye.name, None
+        self.riders_whole = self._eye.riders_whole
         self.decode_size = self._eye.decode_size
         self.hurry = threading.Event()
 
