@@ -117,7 +117,9 @@ def build(out: Path, pictures: int, steps: int) -> None:
     export_network(network, names, SHOWN, out / "plain.onnx", facts)
     quantise(out / "plain.onnx", shown_pictures(whole, SHOWN), out / "plain-int8.onnx")
     plain = DetectionConfig(model=str((out / "plain-int8.onnx").resolve()), confidence=0.04)
-    validation, _ = drawn_test(plain, loaded, VALIDATION, counted("validated", VALIDATION.pictures))
+    (validation,), _ = drawn_test(
+        [plain], loaded, VALIDATION, counted("validated", VALIDATION.pictures)
+    )
     chosen = [choose_confidence(validation, kind, GRID, MOST_FALSE[kind]) for kind in Kind]
     shipped = loaded.config.detection.confidence
     shift_scores(network, chosen, shipped)
@@ -158,15 +160,19 @@ def build(out: Path, pictures: int, steps: int) -> None:
         },
         "validation": sweep(validation, [g for g in GRID if g >= plain.confidence]),
     }
-    for name, file, test in (
-        ("configured_camera", "small-int8.onnx", TEST),
-        ("other_lenses", "small-int8.onnx", OTHER_LENSES),
-        ("configured_camera_float", "small.onnx", TEST),
+    for name, test, files in (
+        ("configured_camera", TEST, {"": "small-int8.onnx", "_float": "small.onnx"}),
+        ("other_lenses", OTHER_LENSES, {"": "small-int8.onnx"}),
     ):
         said = counted(f"tested, {name}", test.pictures)
-        seen, lights = drawn_test(models[file], loaded, test, said)
-        numbers = summary(seen, shipped)
-        card[name] = {"seed": test.seed, **numbers, "lights": by_light(seen, lights, shipped)}
+        found, lights = drawn_test([models[f] for f in files.values()], loaded, test, said)
+        for end, seen in zip(files, found, strict=True):
+            numbers = summary(seen, shipped)
+            card[name + end] = {
+                "seed": test.seed,
+                **numbers,
+                "lights": by_light(seen, lights, shipped),
+            }
     if (out / "experiment.json").is_file():
         card["experiment"] = read(out / "experiment.json")
     write_json(out / "small.json", card)

@@ -53,6 +53,7 @@ def tracker_settings(
         match_radius_m=tracking.match_radius_m,
         max_unseen_s=tracking.max_unseen_s,
         velocity_weight=tracking.velocity_weight,
+        position_weight=tracking.position_weight,
         frame_s=1 / nominal_fps,
         confirm_hits=tracking.confirm_hits,
         max_speed_mps=(

@@ -275,6 +275,16 @@ class TrackingConfig(Section, frozen=True):
             "far",
         ),
     ] = 0.2
+    position_weight: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1,
+            description="weight of a detection against the place where its track was expected, per "
+            "nominal frame; 1, as in the paper's simulation: a track jumps as its boxes do, and "
+            "two who close in seem not to",
+        ),
+    ] = 0.5
     speed_window_frames: Annotated[
         int,
         Meta(ge=1, le=60, description="reported velocity is the displacement over these frames"),
@@ -291,8 +301,7 @@ class TrackingConfig(Section, frozen=True):
             ge=0,
             le=5,
             description="a person without a track, this near to a cyclist's track without a "
-            "detection, is that cyclist, and the reverse; 0: never, as for a model whose cyclists "
-            "are boxed with their rider (the bundled one: always 0), m",
+            "detection, is that cyclist, and the reverse; 0: never, m",
         ),
     ] = 1.0
     max_range_m: Annotated[

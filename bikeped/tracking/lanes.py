@@ -40,6 +40,8 @@ class TrackerSettings:
     come from the configuration. `max_speed_mps` by kind (pedestrian, cyclist, vehicle) gates a
     match: a detection may lie at most speed * time since last seen + `position_noise_m` from the
     track's last seen position. `velocity_weight` is the weight of the newest step per `frame_s`.
+    `position_weight`, also per `frame_s`, is that of a detection's place against the predicted one
+    (with the former an alpha-beta filter; 1: tracks are where their detections are).
     With `unbiased` the smoothed velocity starts at the first step instead of at zero. A track that
     coasts farther than `max_range_m` from the origin is dropped.
 
@@ -55,6 +57,7 @@ class TrackerSettings:
     match_radius_m: float = 3.0
     max_unseen_s: float = 30 / 30
     velocity_weight: float = 0.5
+    position_weight: float = 1.0
     frame_s: float = 1 / 30
     confirm_hits: int = 1
     max_speed_mps: tuple[float, float, float] = (math.inf, math.inf, math.inf)
@@ -210,6 +213,11 @@ class LaneTracker:
         elapsed = np.maximum(time_s - seen_s[flat], _EPSILON_S)
         keep = (1 - self.settings.velocity_weight) ** (elapsed / self.settings.frame_s)
         old_v = velocity[flat]
+        if self.settings.position_weight < 1:
+            expected = (1 - self.settings.position_weight) ** (elapsed / self.settings.frame_s)
+            # A young track has little velocity yet to expect anything by.
+            expected = np.minimum(expected, 1 - 1 / hits[flat])[:, None]
+            new_xy = new_xy + expected * (self.xy_m.reshape(-1, 2)[flat] - new_xy)
         raw_v = (new_xy - seen_xy[flat]) / elapsed[:, None]
         if self.settings.unbiased:
             keep = np.where(hits[flat] == 1, 0.0, keep)

@@ -72,27 +72,28 @@ class Sight:
 
 
 def drawn_test(
-    model: DetectionConfig,
+    models: Sequence[DetectionConfig],
     loaded: LoadedConfig,
     test: DrawnTest,
     progress: Callable[[int], None] = lambda done: None,
-) -> tuple[list[list[Sight]], list[str]]:
-    """What the model made of every picture, and the picture's light and weather.
+) -> tuple[list[list[list[Sight]]], list[str]]:
+    """For each model what it made of every picture, and every picture's light and weather.
 
     `model.model` is an absolute path.
     """
-    detectors: dict[Region, Detector] = {}
+    detectors: dict[Region, list[Detector]] = {}
     range_m = loaded.config.decision.max_range_m
-    seen, lights = [], []
+    seen: list[list[list[Sight]]] = [[] for _ in models]
+    lights = []
     for jpeg, objects, view, conditions in _drawn(loaded, test):
         # Each camera's road, as the service has it of its own camera.
         region = road_region(view.camera, view.framing, range_m)
         if region not in detectors:
-            detectors[region] = load_detector(model, Path("/"), region)
-        found = _look(detectors[region], jpeg, view)
-        seen.append(judge_picture(found, objects, view))
+            detectors[region] = [load_detector(model, Path("/"), region) for model in models]
+        for detector, rows in zip(detectors[region], seen, strict=True):
+            rows.append(judge_picture(_look(detector, jpeg, view), objects, view))
         lights.append("rain" if conditions.weather == "rain" else conditions.light)
-        progress(len(seen))
+        progress(len(lights))
     return seen, lights
 
 

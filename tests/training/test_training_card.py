@@ -162,7 +162,8 @@ def test_the_bundled_model_is_shown_drawn_pictures():
     model = DetectionConfig(model=str(BUNDLED_FILE))
     seen = []
     test = DrawnTest(pictures=6, seed=9_700_001, part=3, processes=2)
-    rows, lights = drawn_test(model, load_config(None), test, seen.append)
+    (rows, again), lights = drawn_test([model, model], load_config(None), test, seen.append)
+    assert again == rows
     assert len(lights) == len(rows) == 6
     assert seen == [1, 2, 3, 4, 5, 6]
     near = [s for row in rows for s in row if s.distance_m < 15 and s.kind != Kind.VEHICLE]

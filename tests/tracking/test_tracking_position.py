@@ -1,0 +1,74 @@
+"""Where a track is, between what was seen and what was expected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bikeped.tracking import LaneTracker, TrackerSettings
+
+RAW = TrackerSettings(velocity_weight=0.2, unbiased=True, max_unseen_s=10.0)
+CALM = replace(RAW, position_weight=0.5)
+
+
+def follow(settings: TrackerSettings, seen: np.ndarray, frames: list[int] | None = None):
+    """Positions [n, 2] of the one track that follows `seen` [n, 2], at these frame numbers."""
+    tracker = LaneTracker(settings)
+    positions = []
+    for frame, xy in zip(frames or range(len(seen)), seen, strict=True):
+        tracker.update(frame / 30, xy.reshape(1, 1, 2), np.zeros((1, 1), np.int8))
+        assert tracker.id[0][tracker.alive[0]].tolist() == [1]
+        positions.append(tracker.xy_m[0][tracker.alive[0]][0].copy())
+    return np.array(positions)
+
+
+def walk(count: int, velocity: tuple[float, float] = (1.4, -0.3)) -> np.ndarray:
+    return np.array([4.0, 9.0]) + np.arange(count)[:, None] / 30 * np.array(velocity)
+
+
+def test_a_weight_of_one_puts_the_track_where_its_detection_is():
+    seen = walk(20) + np.random.default_rng(1).normal(0, 0.2, (20, 2))
+    assert np.array_equal(follow(RAW, seen), seen)
+
+
+@given(st.floats(-9, 9), st.floats(-9, 9), st.floats(0.05, 1))
+def test_who_moves_evenly_is_followed_without_lag(east, north, weight):
+    path = walk(30, (east, north))
+    assert follow(replace(CALM, position_weight=weight), path) == pytest.approx(path, abs=1e-9)
+
+
+def test_noise_is_halved_and_closing_in_shows_over_two_frames():
+    noise = np.random.default_rng(2).normal(0, 0.15, (600, 2))
+    path = walk(600)
+    raw, calm = follow(RAW, path + noise), follow(CALM, path + noise)
+    late = slice(30, None)
+    error = [np.sqrt(((p - path)[late] ** 2).sum(1).mean()) for p in (raw, calm)]
+    assert error[1] < 0.75 * error[0]
+    # What the decision asks: is it farther along than two frames ago?
+    forward = [np.mean(p[32:, 0] > p[30:-2, 0]) for p in (raw, calm)]
+    assert forward[1] > forward[0] + 0.1
+
+
+def test_who_stops_at_once_is_overshot_by_little():
+    path = np.concatenate([walk(60, (5.0, 0.0)), np.repeat(walk(60, (5.0, 0.0))[-1:], 60, 0)])
+    calm = follow(CALM, path)
+    assert np.abs(calm - path).max() < 0.35
+    assert np.abs(calm - path)[-20:].max() < 0.05
+
+
+def test_after_a_gap_the_detection_counts_for_more():
+    frames = [*range(30), 45]
+    seen = np.concatenate([walk(30), walk(46)[45:] + np.array([0.8, 0.0])])
+    calm = follow(CALM, seen, frames)
+    assert calm[-1] == pytest.approx(seen[-1], abs=1e-3)
+    near = follow(CALM, np.concatenate([walk(30), walk(31)[30:] + np.array([0.8, 0.0])]))
+    assert near[-1, 0] - walk(31)[30, 0] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_a_young_track_is_where_it_was_seen():
+    seen = walk(2, (6.0, 0.0))
+    assert np.array_equal(follow(CALM, seen), seen)
