@@ -17,6 +17,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -28,6 +29,7 @@ from bikeped.service.announcer import Announcer
 from bikeped.service.feed import Feed
 from bikeped.service.judge import Judge, Judgement
 from bikeped.service.seldom import Seldom
+from bikeped.service.slot import Slot, first_of
 from bikeped.service.vision import Picture, Vision
 from bikeped.service.workers import Worker
 from bikeped.types import Detections, Frame, Signal
@@ -37,10 +39,6 @@ log = logging.getLogger(__name__)
 #: Frames that do not decode for this long: the camera is opened anew.
 RESTART_AFTER_S = 5.0
 _WEIGHT = 0.2  #: of the newest duration in the usual one
-
-
-#: A picture, and what the eye will have said of it; None where it could not be looked at.
-_Look = tuple[Picture, "asyncio.Task[DetectorAnswer | None]"]
 
 
 class Hung(Exception):  # noqa: N818  a state to leave, not an error of the user's
@@ -77,6 +75,16 @@ class Limits:
     close_s: float = 2.0  #: how long a thread may take to end
 
 
+@dataclass(frozen=True)
+class _Look:
+    """A picture that a worker looks at since `began_s`, and what the eye will have said of it."""
+
+    picture: Picture
+    worker: Worker
+    began_s: float
+    answer: asyncio.Future[DetectorAnswer]
+
+
 @dataclass
 class Counts:
     """Totals since the start."""
@@ -102,13 +110,16 @@ class Loop:
         limits: Limits = Limits(),
         clock: Callable[[], float] = time.monotonic,
         on_tick: Callable[[], None] = lambda: None,
+        looks_at_once: int = 1,
     ) -> None:
+        """`looks_at_once`: pictures that the eye may be handed before it has answered the first."""
         self._feed, self._vision, self._judge = feed, vision, judge
         self._announcer = announcer
         self._outputs = tuple(outputs)
         self._limits = limits
         self._clock = clock
         self._on_tick = on_tick
+        self._looks_at_once = looks_at_once
         self.counts = Counts()
         self._seldom = Seldom(log)
         self._stop = asyncio.Event()
@@ -148,9 +159,10 @@ class Loop:
         light in FAULT; for a recording also the error of a frame that cannot be judged
         (GeometryError, DetectorError). Threads that hang are left behind: they are daemons.
         """
-        slot = _Slot()
-        decoder, looker = Worker("decode", self._clock), Worker("look", self._clock)
-        looking = asyncio.create_task(self._look(slot, looker), name="look")
+        slot = Slot()
+        decoder = Worker("decode", self._clock)
+        lookers = [Worker("look", self._clock) for _ in range(self._looks_at_once)]
+        looking = asyncio.create_task(self._look(slot, lookers), name="look")
         stopping = asyncio.create_task(self._stop.wait(), name="stop")
         tasks: set[asyncio.Task[None] | asyncio.Task[bool]] = {
             looking,
@@ -158,7 +170,7 @@ class Loop:
             asyncio.create_task(self._decode(slot, decoder), name="decode"),
         }
         if self._feed.live:
-            tasks.add(asyncio.create_task(self._tick((decoder, looker)), name="tick"))
+            tasks.add(asyncio.create_task(self._tick((decoder, *lookers)), name="tick"))
         try:
             pending = set(tasks)
             while not (looking.done() or stopping.done()):
@@ -179,11 +191,11 @@ class Loop:
             await asyncio.gather(*tasks, return_exceptions=True)
             await asyncio.gather(
                 decoder.close(self._limits.close_s),
-                looker.close(self._limits.close_s),
+                *(looker.close(self._limits.close_s) for looker in lookers),
                 self._feed.close(),
             )
 
-    async def _decode(self, slot: _Slot, worker: Worker) -> None:
+    async def _decode(self, slot: Slot, worker: Worker) -> None:
         while True:
             # Room first, then the frame: a live frame taken early would only grow old.
             await slot.room()
@@ -219,61 +231,68 @@ class Loop:
             ahead_s = 2 * self._usual_decode_s + 0.005
             await asyncio.sleep(min(max(free_s - ahead_s - time.perf_counter(), 0.0), 0.2))
 
-    async def _look(self, slot: _Slot, worker: Worker) -> None:
-        following: _Look | None = None
+    async def _look(self, slot: Slot, workers: Sequence[Worker]) -> None:
+        """Lets every worker look at a picture of its own, and judges them in their order."""
+        free, looks = list(workers), deque[_Look]()
         try:
-            while True:
-                if following is None:
-                    picture = await slot.take()
-                    if picture is None:
-                        return
-                    following = self._begin(picture, worker)
-                picture, answering = following
-                answer = await answering
+            while not (slot.ended and not looks):
+                self._begin_looks(slot, free, looks)
+                if not looks:
+                    await slot.filled()
+                    continue
+                if free and not slot.ended:
+                    await first_of(looks[0].answer, slot.filled())
+                else:
+                    await asyncio.wait({looks[0].answer})
+                if not looks[0].answer.done():
+                    continue
+                look = looks.popleft()
+                free.append(look.worker)
+                answer = self._answer(look)
                 # What waits already is looked at while this one is judged: the eye is the slowest.
-                waiting = slot.take_waiting()
-                following = None if waiting is None else self._begin(waiting, worker)
-                if following is not None:
-                    await asyncio.sleep(0)  # the eye begins
+                self._begin_looks(slot, free, looks)
                 if answer is not None:
-                    await self._finish(picture, answer)
+                    await self._finish(look.picture, answer)
         finally:
-            if following is not None:
-                following[1].cancel()
-                await asyncio.gather(following[1], return_exceptions=True)
+            for look in looks:
+                if not look.answer.cancel() and not look.answer.cancelled():
+                    look.answer.exception()  # of an end that has a cause already
 
-    def _begin(self, picture: Picture, worker: Worker) -> _Look:
-        return picture, asyncio.create_task(self._answer(picture, worker), name="answer")
+    def _begin_looks(self, slot: Slot, free: list[Worker], looks: deque[_Look]) -> None:
+        """Hands what waits to whoever has nothing to look at."""
+        while free and (picture := slot.take()) is not None:
+            frame = picture.frame
+            try:
+                self._judge.framing_of(frame.width, frame.height)
+            except GeometryError as error:
+                if not self._feed.live:
+                    raise
+                self._geometry_fault = f"geometry: {error}"
+                self._show()
+                continue
+            self._geometry_fault = None
+            worker, began_s = free.pop(), time.perf_counter()
+            self._looking_since_s = began_s
+            answer = worker.submit(self._vision.see, picture)
+            looks.append(_Look(picture, worker, began_s, answer))
 
-    async def _answer(self, picture: Picture, worker: Worker) -> DetectorAnswer | None:
-        """What the eye says of a picture; None when a live one cannot be looked at."""
-        frame = picture.frame
+    def _answer(self, look: _Look) -> DetectorAnswer | None:
+        """What the eye says of a picture; None when a live one could not be looked at."""
+        self._usual_look_s += _WEIGHT * (time.perf_counter() - look.began_s - self._usual_look_s)
+        self._looking_since_s = None
         try:
-            self._judge.framing_of(frame.width, frame.height)
-        except GeometryError as error:
-            if not self._feed.live:
-                raise
-            self._geometry_fault = f"geometry: {error}"
-            self._show()
-            return None
-        self._geometry_fault = None
-        self._looking_since_s = time.perf_counter()
-        try:
-            answer = await worker.submit(self._vision.see, picture)
+            answer = look.answer.result()
         except Exception as error:
             if not self._feed.live:
                 raise
+            number = look.picture.frame.number
             self.counts.failed += 1
             if isinstance(error, BikepedError):
-                self._seldom.warn("detector", f"frame {frame.number} is skipped: {error}")
+                self._seldom.warn("detector", f"frame {number} is skipped: {error}")
             else:
                 self._seldom.failure("detector", error)
             self._detector_fault = self._detector_fault or (f"detector: {error}", self._clock())
             return None
-        finally:
-            took_s = time.perf_counter() - self._looking_since_s
-            self._usual_look_s += _WEIGHT * (took_s - self._usual_look_s)
-            self._looking_since_s = None
         self._detector_fault = None
         return answer
 
@@ -361,7 +380,7 @@ class Loop:
         causes = [cause[0] for cause in (self._decode_fault, self._detector_fault) if cause]
         return (*faults, *causes)
 
-    async def _tick(self, workers: tuple[Worker, ...]) -> None:
+    async def _tick(self, workers: Sequence[Worker]) -> None:
         """Judges the silence between frames, and whether a thread is stuck."""
         limit_s = self._limits.hang_after_s
         while True:
@@ -379,36 +398,3 @@ class Loop:
             if self._decode_fault is not None and (now_s - self._decode_fault[1] > RESTART_AFTER_S):
                 self._decode_fault = (self._decode_fault[0], now_s)
                 self._feed.restart()
-
-
-class _Slot:
-    """Room for one picture between two workers; None is the end."""
-
-    def __init__(self) -> None:
-        self._item: Picture | None = None
-        self._filled, self._empty = asyncio.Event(), asyncio.Event()
-        self._empty.set()
-
-    async def room(self) -> None:
-        """Returns when the slot is empty."""
-        await self._empty.wait()
-
-    def put(self, item: Picture | None) -> None:
-        self._item = item
-        self._empty.clear()
-        self._filled.set()
-
-    def take_waiting(self) -> Picture | None:
-        """The picture that is there now, if there is one; the end stays where it is."""
-        return None if self._item is None else self._take()
-
-    async def take(self) -> Picture | None:
-        """The picture, as soon as there is one."""
-        await self._filled.wait()
-        return self._take()
-
-    def _take(self) -> Picture | None:
-        item, self._item = self._item, None
-        self._filled.clear()
-        self._empty.set()
-        return item

@@ -3,25 +3,49 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
+
+import msgspec
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig, road_region
 from bikeped.detection.base import load_detector
 from bikeped.errors import DetectorError
-from bikeped.service.vision import Eye, ModelEye
+from bikeped.service.vision import MOST_LOOKS, Eye, ModelEye
 from bikeped.telemetry.messages import EventHeader, event_header
 from bikeped.telemetry.mqtt import MqttPublisher
 
 
-def load_eye(loaded: LoadedConfig) -> Eye:
-    """The configured model; DetectorError names the key and the mend."""
-    if loaded.config.detection.model is None:
+def load_eye(loaded: LoadedConfig, *, recorded: bool = False) -> ModelEye:
+    """The configured model; DetectorError names the key and the mend.
+
+    `recorded`: it looks at a recording, where the rate counts and nothing waits for one frame. On a
+    processor whose threads the configuration leaves open, two copies with half of the cores each
+    look at two frames: threads of one inference wait for one another at every layer.
+    """
+    detection, base = loaded.config.detection, loaded.base_dir
+    if detection.model is None:
         raise DetectorError(
             f"{loaded.source}: detection.model: no model is configured; name an .onnx or .engine "
             "file there, or with --set detection.model=FILE"
         )
-    return ModelEye(load_detector(loaded.config.detection, loaded.base_dir, road_region(loaded)))
+    road = road_region(loaded)
+    cores = len(os.sched_getaffinity(0))
+    if not (recorded and cores >= MOST_LOOKS and detection.threads == 0 and _on_cpu(loaded)):
+        return ModelEye(load_detector(detection, base, road))
+    shared = msgspec.structs.replace(detection, threads=cores // MOST_LOOKS)
+    return ModelEye(*(load_detector(shared, base, road) for _ in range(MOST_LOOKS)))
+
+
+def _on_cpu(loaded: LoadedConfig) -> bool:
+    """Whether the processor runs the configured model."""
+    model = loaded.config.detection.model
+    if model is None or model.lower().endswith(".engine"):
+        return False
+    from bikeped.detection.onnx_runtime import runs_on_cpu
+
+    return runs_on_cpu(loaded.config.detection.providers)
 
 
 def header_of(loaded: LoadedConfig, eye: Eye) -> EventHeader:

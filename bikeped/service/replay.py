@@ -25,7 +25,7 @@ from bikeped.service.pages import Inside, Pages, open_pages
 from bikeped.service.parts import header_of, load_eye, start_publisher
 from bikeped.service.recording import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
 from bikeped.service.telemetry import Telemetry
-from bikeped.service.vision import Eye, Vision
+from bikeped.service.vision import Eye, ModelEye, Vision
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.messages import HealthMessage, Part
 from bikeped.telemetry.metrics import Metrics
@@ -114,7 +114,7 @@ def replay(
         except GeometryError as error:
             raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
         warnings = [] if eye is not None else _size_warnings(loaded, source)
-        looking = eye if eye is not None else load_eye(loaded)
+        looking = eye if eye is not None else load_eye(loaded, recorded=True)
         judge.expect(riders_whole=looking.riders_whole)
         return asyncio.run(
             _replay(
@@ -176,6 +176,7 @@ async def _replay(
                 SignalLogic.from_config(config.feedback), light, listeners=(telemetry, *watchers)
             ),
             outputs=outputs,
+            looks_at_once=eye.at_once if isinstance(eye, ModelEye) else 1,
         )
         part = Part(ok=True, detail="simulated")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import time
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,8 +11,10 @@ from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.base import Detector, DetectorAnswer
 from bikeped.types import Frame, ImageArray
 
-#: Pictures in use at once: being decoded, waiting, looked at, judged, and being drawn.
-PICTURES = 6
+#: A recording is looked at by so many at once, where the processor does it: see `load_eye`.
+MOST_LOOKS = 2
+#: Pictures in use at once: being decoded, waiting, judged, being drawn, one more, and looked at.
+PICTURES = 5 + MOST_LOOKS
 
 
 @dataclass(frozen=True)
@@ -36,29 +39,39 @@ class Eye(Protocol):
         """Least picture size that it needs of a frame of this size."""
 
     def see(self, picture: Picture) -> DetectorAnswer:
-        """What is in the picture; raises DetectorError. Called in one worker thread."""
+        """What is in the picture; raises DetectorError. Called in worker threads, as many as looks
+        are allowed at once (see `Loop`)."""
 
 
 class ModelEye:
-    """A detector model."""
+    """A detector model, in as many copies as pictures are looked at once; each has one thread."""
 
-    def __init__(self, detector: Detector) -> None:
-        self._detector = detector
-        self.name = detector.name
-        self.model_hash: str | None = detector.model_hash
-        self.riders_whole = detector.riders_whole
+    def __init__(self, *detectors: Detector) -> None:
+        first = detectors[0]
+        self.name = first.name
+        self.model_hash: str | None = first.model_hash
+        self.riders_whole = first.riders_whole
+        self.at_once = len(detectors)
+        self._decode_size = first.decode_size
+        self._free: queue.SimpleQueue[Detector] = queue.SimpleQueue()
+        for detector in detectors:
+            self._free.put(detector)
 
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
-        return self._detector.decode_size(width, height)
+        return self._decode_size(width, height)
 
     def see(self, picture: Picture) -> DetectorAnswer:
-        return self._detector.infer(picture.rgb, picture.frame.width, picture.frame.height)
+        detector = self._free.get()
+        try:
+            return detector.infer(picture.rgb, picture.frame.width, picture.frame.height)
+        finally:
+            self._free.put(detector)
 
 
 class Vision:
     """An eye, and the decoding at the smallest scale that it (and a picture for people) needs.
 
-    `decode` and `see` each belong to one thread, which may be two.
+    `decode` belongs to one thread and `see` to others, one if its eye does not say more.
     """
 
     def __init__(self, eye: Eye, view_width: int = 0) -> None:

@@ -187,6 +187,7 @@ class Rig:
         self.outputs: list[object] = [self.recorder]
         self.limits = Limits(tick_s=0.005, close_s=0.05)
         self.judge = Judge(self.config)
+        self.looks_at_once = 1
 
     def start(self) -> None:
         self.announcer = Announcer(
@@ -203,6 +204,7 @@ class Rig:
             limits=self.limits,
             clock=self.clock,
             on_tick=self.recorder.tick,
+            looks_at_once=self.looks_at_once,
         )
         self.task = asyncio.create_task(self.loop.run())
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 
 import pytest
 from service_fakes import PATIENCE_S, FakeEye, Rig, seen, small
 
+import bikeped.service.loop as loop_module
+from bikeped.detection.base import DetectorAnswer
 from bikeped.errors import CaptureError, DetectorError, GeometryError
 from bikeped.service.loop import RESTART_AFTER_S, Hung, Limits, Outcome
+from bikeped.service.slot import Slot
+from bikeped.service.vision import Picture
 from bikeped.types import Colour, Kind
 
 REASSURING = {Colour.BLUE, Colour.GREEN}
@@ -271,32 +276,98 @@ async def test_a_recording_ends_the_loop_after_its_last_frame():
         assert rig.recorder.ticks == 0  # a recording is not late
 
 
-class Meanwhile:
-    """Takes an outcome only when the eye has begun with the next frame."""
+class PatientEye(FakeEye):
+    """Answers about a frame when the next one (or the end) waits in the slot."""
 
-    def __init__(self, eye: FakeEye, last: int) -> None:
-        self.eye, self.last = eye, last
-        self.numbers: list[int] = []
+    def __init__(self) -> None:
+        super().__init__()
+        self.put = 0
+        self.changed = threading.Condition()
 
-    async def frame(self, outcome: Outcome) -> None:
-        number = outcome.picture.frame.number
-        self.numbers.append(number)
-        deadline = asyncio.get_running_loop().time() + PATIENCE_S
-        while number < self.last and self.eye.looks < number + 2:
-            assert asyncio.get_running_loop().time() < deadline
-            await asyncio.sleep(0)
+    def see(self, picture: Picture) -> DetectorAnswer:
+        answer = super().see(picture)
+        with self.changed:
+            assert self.changed.wait_for(lambda: self.put >= picture.frame.number + 2, PATIENCE_S)
+        return answer
 
 
-async def test_what_waits_is_looked_at_while_a_frame_is_judged():
+async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
     rig = Rig(live=False)
-    output = Meanwhile(rig.eye, last=9)
-    rig.outputs.append(output)
+    rig.eye = eye = PatientEye()
+    judged: list[int] = []
+
+    class Watched(Slot):
+        def put(self, item: Picture | None) -> None:
+            super().put(item)
+            with eye.changed:
+                eye.put += 1
+                eye.changed.notify_all()
+
+    class Output:
+        """Takes an outcome only when the eye has begun with the next frame."""
+
+        async def frame(self, outcome: Outcome) -> None:
+            judged.append(outcome.picture.frame.number)
+            deadline = asyncio.get_running_loop().time() + PATIENCE_S
+            while judged[-1] < 9 and eye.looks < judged[-1] + 2:
+                assert asyncio.get_running_loop().time() < deadline
+                await asyncio.sleep(0)
+
+    monkeypatch.setattr(loop_module, "Slot", Watched)
+    rig.outputs.append(Output())
     for n in range(10):
         rig.feed.put(n / 30)
     rig.feed.queue.put_nowait(None)
     async with rig:
         await rig.ended()
-    assert output.numbers == list(range(10))
+    assert judged == list(range(10))
+
+
+class PairedEye(FakeEye):
+    """Answers only when two look at once, about the later frame first."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.both = threading.Barrier(2, timeout=PATIENCE_S)
+        self.later = threading.Event()
+
+    def see(self, picture: Picture) -> DetectorAnswer:
+        self.both.wait()
+        if picture.frame.number % 2:
+            self.later.set()
+        else:
+            assert self.later.wait(PATIENCE_S)
+            self.later.clear()
+        if self.error is not None and picture.frame.number == 5:
+            raise self.error
+        return DetectorAnswer(self.answer, 0.1, 1.0, 0.1)
+
+
+@pytest.mark.parametrize("count", [8, 10])
+async def test_two_looks_at_once_are_judged_in_order(count):
+    rig = Rig(live=False)
+    rig.eye = PairedEye()
+    rig.looks_at_once = 2
+    for n in range(count):
+        rig.feed.put(n / 30)
+    rig.feed.queue.put_nowait(None)
+    async with rig:
+        await rig.ended()
+    assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(count))
+
+
+async def test_the_second_of_two_looks_fails_after_the_first_is_judged():
+    rig = Rig(live=False)
+    rig.eye = PairedEye()
+    rig.eye.error = DetectorError("out of memory")
+    rig.looks_at_once = 2
+    for n in range(10):
+        rig.feed.put(n / 30)
+    async with rig:
+        with pytest.raises(DetectorError, match="out of memory"):
+            await rig.ended()
+        rig.eye.both.abort()  # whoever looks now
+    assert [o.picture.frame.number for o in rig.recorder.outcomes] == [0, 1, 2, 3, 4]
 
 
 async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
