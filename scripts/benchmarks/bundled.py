@@ -25,7 +25,7 @@ def run(figures: Figures) -> None:
     from bikeped.scene.clip import encode_jpeg
     from bikeped.service.replay import replay
 
-    # As deployed: ONNX Runtime takes as many threads as it likes.
+    # As `bikeped replay` has it: two copies of the model share the cores.
     loaded = load_config(None, ("detection.model=bundled", "detection.providers=[cpu]"))
     in_float = load_config(None, (f"detection.model={BUNDLED_FILE}", "detection.providers=[cpu]"))
     scenario = load_scenario(bundled_folder() / "dense-pedestrian-group.yaml")
