@@ -17,7 +17,7 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
 from bikeped.files import make_folder, write_whole
 from bikeped.models import BUNDLED_FILE
+from bikeped.scene.chance import USUAL_MIX
 from bikeped.training.augment import AugmentSettings, augment_data
 from bikeped.training.card import (
     DrawnTest,
@@ -56,7 +57,7 @@ from bikeped.types import Kind
 PICTURES, STEPS = 5000, 5200
 #: Width and height of the whole frame as the shipped network is shown it: what two cores answer 30
 #: times a second. It learns on pictures 1280 across, made smaller and larger about this.
-SHOWN = (1056, 608)
+SHOWN = (1152, 672)
 TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
 VALIDATION = DrawnTest(pictures=1200, seed=8_000_001)
 TEST = DrawnTest(pictures=600, seed=9_000_001)
@@ -154,6 +155,8 @@ def build(out: Path, pictures: int, steps: int) -> None:
             "commit": commit(),
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             "seed_data": TRAINING.seed,
+            "mix": asdict(TRAINING.mix),
+            "usual_mix": asdict(USUAL_MIX),
             "most_false": {kind.label: most for kind, most in MOST_FALSE.items()},
             "drawing": read(out / "drawing.json"),
             "training": within(out, read(training / "training.json")),

@@ -31,6 +31,7 @@ doctor` say so where it is configured.
 {pictures} pictures drawn by `bikeped.scene` ({objects} objects), and nothing else: no photograph,
 no other network's weights. Seven tenths were seen by the configured camera from varied spots, the
 others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 to 5.5 m high).
+There is more of what is hard to tell than in the streets it is measured on: {mix}.
 
 | | |
 | --- | --- |
@@ -89,6 +90,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         commit=made["commit"],
         seed_data=made["seed_data"],
         seed=settings["seed"],
+        mix=_mix(made["mix"], made["usual_mix"]),
         drawing_min=made["drawing"]["seconds"] / 60,
         drawing_note=made["drawing"].get("note", ""),
         training_min=training["seconds"] / 60,
@@ -119,6 +121,20 @@ def card_text(card: Mapping[str, Any]) -> str:
     if "experiment" in card:
         text += "\n" + _experiment(card["experiment"])
     return text
+
+
+def _mix(mine: Mapping[str, float], usual: Mapping[str, float]) -> str:
+    """How the streets to learn from differ from those to be measured on."""
+    words = {
+        "scooters": "cyclists are on e-scooters",
+        "wheelchairs": "pedestrians use a wheelchair",
+        "beside": "pedestrians stand close to somebody",
+    }
+    parts = [f"{mine[k]:.0%} of the {what} ({usual[k]:.0%})" for k, what in words.items()]
+    things = (
+        f"up to {mine['clutter']:g} more bollards, bins, signs and hydrants stand near the camera"
+    )
+    return f"{', '.join(parts)}, and {things}"
 
 
 def reached(test: Mapping[str, Any]) -> bool:
