@@ -103,7 +103,8 @@ def build(out: Path, pictures: int, steps: int) -> None:
     if not (data / "annotations.json").is_file():
         began = time.monotonic()
         draw_set(data, replace(TRAINING, pictures=pictures), loaded, counted("drawn", pictures))
-        write_json(out / "drawing.json", {"seconds": round(time.monotonic() - began, 1)})
+        drawing = {"seconds": round(time.monotonic() - began, 1), "mix": asdict(TRAINING.mix)}
+        write_json(out / "drawing.json", drawing)
     training = out / "training"
     if not (training / "training.json").is_file():
         make_folder(training)
@@ -155,7 +156,6 @@ def build(out: Path, pictures: int, steps: int) -> None:
             "commit": commit(),
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             "seed_data": TRAINING.seed,
-            "mix": asdict(TRAINING.mix),
             "usual_mix": asdict(USUAL_MIX),
             "most_false": {kind.label: most for kind, most in MOST_FALSE.items()},
             "drawing": read(out / "drawing.json"),

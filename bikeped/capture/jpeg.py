@@ -70,6 +70,8 @@ class JpegDecoder:
                 np.uint8,
             )
         except (ValueError, RuntimeError, MemoryError) as error:
+            # Nobody holds this buffer: a row of damaged pictures must not run into those in use.
+            self._turn -= 1
             raise CaptureError(f"JPEG: damaged or cut off ({error})") from error
 
     def _next_buffer(self, size: int) -> npt.NDArray[np.uint8]:

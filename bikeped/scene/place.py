@@ -193,7 +193,7 @@ def _fixtures(
 
 
 def _clutter(number: int, count: int, kerb: float) -> tuple[Fixture, ...]:
-    """Things of a person's size on the sidewalk below the usual camera."""
+    """Things of a person's size below the usual camera, also where no city would put them."""
     rng = np.random.default_rng((number, 97))
     return tuple(
         Fixture(

@@ -1,7 +1,8 @@
 """The loop: frame, picture, detections, judgement, signal, messages.
 
-Two workers, each with one thread: one decodes, one looks. At most one picture waits between them,
-so that the next frame is decoded while the last one is looked at. Everything else (ground, track,
+Workers, each with one thread: one decodes, the others look (one, or two at a recording). At most
+one picture waits between them, so that the next frame is decoded while the last one is looked at;
+what they answer is judged in the frames' order. Everything else (ground, track,
 decide, signal, queues) happens on the event loop and takes about a millisecond. `run` and `replay`
 differ only in their feed and their clock.
 
@@ -248,6 +249,7 @@ class Loop:
                     continue
                 look = looks.popleft()
                 free.append(look.worker)
+                self._looking_since_s = looks[0].began_s if looks else None
                 answer = self._answer(look)
                 # What waits already is looked at while this one is judged: the eye is the slowest.
                 self._begin_looks(slot, free, looks)
@@ -265,21 +267,24 @@ class Loop:
             try:
                 self._judge.framing_of(frame.width, frame.height)
             except GeometryError as error:
-                if not self._feed.live:
-                    raise
-                self._geometry_fault = f"geometry: {error}"
-                self._show()
+                if self._feed.live:
+                    self._geometry_fault = f"geometry: {error}"
+                    self._show()
+                    continue
+                # Ends the replay when the frames before it are judged.
+                answer: asyncio.Future[DetectorAnswer] = asyncio.get_running_loop().create_future()
+                answer.set_exception(error)
+                looks.append(_Look(picture, free.pop(), time.perf_counter(), answer))
                 continue
             self._geometry_fault = None
             worker, began_s = free.pop(), time.perf_counter()
-            self._looking_since_s = began_s
             answer = worker.submit(self._vision.see, picture)
             looks.append(_Look(picture, worker, began_s, answer))
+            self._looking_since_s = looks[0].began_s
 
     def _answer(self, look: _Look) -> DetectorAnswer | None:
         """What the eye says of a picture; None when a live one could not be looked at."""
         self._usual_look_s += _WEIGHT * (time.perf_counter() - look.began_s - self._usual_look_s)
-        self._looking_since_s = None
         try:
             answer = look.answer.result()
         except Exception as error:

@@ -31,7 +31,7 @@ def load_eye(loaded: LoadedConfig, *, recorded: bool = False) -> ModelEye:
             "file there, or with --set detection.model=FILE"
         )
     road = road_region(loaded)
-    cores = len(os.sched_getaffinity(0))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     if not (recorded and cores >= MOST_LOOKS and detection.threads == 0 and _on_cpu(loaded)):
         return ModelEye(load_detector(detection, base, road))
     shared = msgspec.structs.replace(detection, threads=cores // MOST_LOOKS)

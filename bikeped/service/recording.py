@@ -122,9 +122,15 @@ class OverlayVideo:
 
     async def wait(self) -> None:
         """Until the frame in hand is drawn; raises what went wrong."""
-        task, self._drawing = self._drawing, None
-        if task is not None:
-            await task
+        task = self._drawing
+        if task is None:
+            return
+        try:
+            # Who is told to stop meanwhile leaves the thread at it: the next one must wait, too.
+            await asyncio.shield(task)
+        finally:
+            if task.done():
+                self._drawing = None
 
 
 class Progress:

@@ -114,7 +114,7 @@ def replay(
         except GeometryError as error:
             raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
         warnings = [] if eye is not None else _size_warnings(loaded, source)
-        looking = eye if eye is not None else load_eye(loaded, recorded=True)
+        looking = eye if eye is not None else load_eye(loaded, recorded=not realtime)
         judge.expect(riders_whole=looking.riders_whole)
         return asyncio.run(
             _replay(

@@ -38,8 +38,8 @@ class TrackerSettings:
 
     The defaults are the tracker of the paper's simulation (definitions, section 7); the pole's
     come from the configuration. `max_speed_mps` by kind (pedestrian, cyclist, vehicle) gates a
-    match: a detection may lie at most speed * time since last seen + `position_noise_m` from the
-    track's last seen position. `velocity_weight` is the weight of the newest step per `frame_s`.
+    match: a detection may lie at most speed * time since last seen + `position_noise_m` from where
+    the track was then. `velocity_weight` is the weight of the newest step per `frame_s`.
     `position_weight`, also per `frame_s`, is that of a detection's place against the predicted one
     (with the former an alpha-beta filter; 1: tracks are where their detections are).
     With `unbiased` the smoothed velocity starts at the first step instead of at zero. A track that
@@ -215,8 +215,11 @@ class LaneTracker:
         old_v = velocity[flat]
         if self.settings.position_weight < 1:
             expected = (1 - self.settings.position_weight) ** (elapsed / self.settings.frame_s)
-            # A young track has little velocity yet to expect anything by.
-            expected = np.minimum(expected, 1 - 1 / hits[flat])[:, None]
+            # A young track's velocity is that of a few noisy steps: at first the weights are those
+            # with which the filter fits a line to all of its sights.
+            n = hits[flat] + 1
+            expected = np.minimum(expected, 1 - 2 * (2 * n - 1) / (n * (n + 1)))[:, None]
+            keep = np.minimum(keep, 1 - 3 / (2 * n - 1))
             new_xy = new_xy + expected * (self.xy_m.reshape(-1, 2)[flat] - new_xy)
         raw_v = (new_xy - seen_xy[flat]) / elapsed[:, None]
         if self.settings.unbiased:
@@ -253,8 +256,13 @@ class LaneTracker:
         )
         on, off = _WHOLE_SHARES if whole else _CYCLE_SHARES
         was = kind[flat]
-        kind[flat] = np.where((was == _PEDESTRIAN) & (share[flat] > on), _CYCLIST, was)
-        kind[flat] = np.where((was == _CYCLIST) & (share[flat] < off), _PEDESTRIAN, kind[flat])
+        rides = (was == _PEDESTRIAN) & (share[flat] > on)
+        walks = (was == _CYCLIST) & (share[flat] < off)
+        if whole:  # of the first two sights the newer one is right: most people come nearer
+            young = self.hits.reshape(-1)[flat] == 2
+            rides |= young & (seen == _CYCLIST)
+            walks |= young & (seen == _PEDESTRIAN)
+        kind[flat] = np.where(rides, _CYCLIST, np.where(walks, _PEDESTRIAN, was))
 
     def _drop(self, time_s: float) -> None:
         unseen = time_s - self.seen_s

@@ -90,7 +90,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         commit=made["commit"],
         seed_data=made["seed_data"],
         seed=settings["seed"],
-        mix=_mix(made["mix"], made["usual_mix"]),
+        mix=_mix(made["drawing"]["mix"], made["usual_mix"]),
         drawing_min=made["drawing"]["seconds"] / 60,
         drawing_note=made["drawing"].get("note", ""),
         training_min=training["seconds"] / 60,

@@ -45,6 +45,7 @@ class _Eye:
 
     name = "none: the boxes of what was drawn"
     model_hash: str | None = None
+    riders_whole = True
 
     def __init__(self, clip: Path) -> None:
         self._frames = read_sidecar(sidecar_path(clip)).frames

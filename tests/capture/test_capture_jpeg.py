@@ -56,6 +56,19 @@ def test_the_smallest_scale_that_is_not_smaller_than_asked(asked, eighths):
     assert np.abs(image.astype(int) - wanted).mean() < 3.0
 
 
+def test_damaged_pictures_in_a_row_leave_those_in_use_alone():
+    decoder = JpegDecoder(buffers=3)
+    held = [decoder.decode(GOOD) for _ in range(2)]
+    before = [image.copy() for image in held]
+    for _ in range(7):
+        with pytest.raises(CaptureError):
+            decoder.decode(GOOD[: len(GOOD) // 2])
+    for image, was in zip(held, before, strict=True):
+        assert np.array_equal(image, was)
+    assert np.array_equal(decoder.decode(GOOD), before[0])
+    assert np.array_equal(held[0], before[0])
+
+
 def test_buffers_take_turns_and_are_reused():
     decoder = JpegDecoder(buffers=3)
     images = [decoder.decode(GOOD) for _ in range(6)]

@@ -7,7 +7,7 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.service.judge import Judge
-from bikeped.types import Detections, Kind
+from bikeped.types import Detections, Kind, State
 
 P, C = Kind.PEDESTRIAN, Kind.CYCLIST
 
@@ -30,6 +30,23 @@ def test_only_where_bicycles_are_easily_missed_a_person_stays_on_one(riders_whol
     for _ in range(2):  # nothing of the first round is left in the second
         judge.expect(riders_whole=riders_whole)
         assert kinds_of_a_walker_first_taken_for_a_cyclist(judge) == {expected}
+
+
+@pytest.mark.parametrize("wrong", [P, C])
+def test_one_wrong_first_sight_starts_no_memory_of_a_cyclist(wrong):
+    """Two sights make a track; when they differ, the newer one is right."""
+    judge = Judge(load_config(None))
+    judge.expect(riders_whole=True)
+    right = P if wrong is C else C
+    box = np.array([[1880.0, 1500.0, 1960.0, 1800.0]], np.float32)
+    for frame in range(20):
+        kind = np.array([wrong if frame == 0 else right], np.int8)
+        seen = Detections(kind, np.array([0.9], np.float32), box)
+        judgement = judge.judge(seen, 3840, 2160, frame / 30, 0.0)
+        assert set(judgement.tracks.kind.tolist()) <= {right}
+        assert judgement.decision.state in (
+            {State.IDLE, State.SAFE} if right is P else {State.IDLE}
+        )
 
 
 def test_another_detector_forgets_what_the_first_one_saw():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 
+import numpy as np
 import pytest
 from service_fakes import PATIENCE_S, FakeEye, Rig, seen, small
 
@@ -388,6 +389,19 @@ async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
             await rig.ended()
     assert judged in ([0, 1, 2], [0, 1, 2, 3])  # the look after the third may have begun already
     assert rig.light.shown[-1].name == "OFF"
+
+
+@pytest.mark.parametrize("looks", [1, 2])
+async def test_frames_before_one_of_other_proportions_are_judged(looks):
+    rig = Rig(live=False)
+    rig.looks_at_once = looks
+    for n in range(6):
+        rig.feed.put(n / 30)
+    rig.feed.put(6 / 30, width=64, height=96, rgb=np.zeros((96, 64, 3), np.uint8))
+    async with rig:
+        with pytest.raises(GeometryError):
+            await rig.ended()
+    assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(6))
 
 
 async def test_an_output_that_fails_while_the_eye_hangs_ends_a_replay():

@@ -69,6 +69,23 @@ def test_after_a_gap_the_detection_counts_for_more():
     assert near[-1, 0] - walk(31)[30, 0] == pytest.approx(0.4, abs=1e-6)
 
 
+def test_a_young_track_is_calmer_than_its_sights_and_does_not_seem_to_walk():
+    rng = np.random.default_rng(4)
+    error, moved = {RAW: [], CALM: []}, {RAW: [], CALM: []}
+    for _ in range(400):
+        seen = np.array([5.0, 7.0]) + rng.normal(0, 0.05, (9, 2))
+        for settings in (RAW, CALM):
+            found = follow(settings, seen) - (5.0, 7.0)
+            error[settings].append((found**2).sum(1))
+            moved[settings].append(np.hypot(*(found[2:] - found[:-2]).T) > 0.15)
+    noise = [np.sqrt(np.mean(error[settings], axis=0)) for settings in (RAW, CALM)]
+    assert (noise[1][2:] < noise[0][2:]).all()
+    assert noise[1][-1] < 0.7 * noise[0][-1]
+    walks = [np.mean(moved[settings], axis=0) for settings in (RAW, CALM)]
+    assert walks[1][0] < walks[0][0] + 0.06  # of three sights, nobody can say much
+    assert (walks[1][1:] < 0.5 * walks[0][1:]).all()
+
+
 def test_a_young_track_is_where_it_was_seen():
     seen = walk(2, (6.0, 0.0))
     assert np.array_equal(follow(CALM, seen), seen)

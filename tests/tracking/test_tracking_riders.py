@@ -98,7 +98,9 @@ def test_where_riders_are_whole_a_walker_first_taken_for_a_cyclist_is_soon_a_wal
         assert len(kinds(tracker)) == 1  # and there is no ghost of a cyclist
         wrong += kinds(tracker) == {1: C}
     assert kinds(tracker) == {1: P}
-    assert wrong <= 2 * wrong_frames + 1
+    assert wrong < 2 * wrong_frames + (
+        wrong_frames > 1
+    )  # at two sights that differ, the newer one is right
 
 
 def test_where_riders_are_whole_the_most_frequent_kind_is_the_tracks():
