@@ -243,7 +243,13 @@ class DetectionConfig(Section, frozen=True):
         str, Meta(min_length=1, description="folder for TensorRT engines built from ONNX")
     ] = "~/.cache/bikeped/engines"
     threads: Annotated[
-        int, Meta(ge=0, le=256, description="CPU threads for inference; 0 lets the runtime choose")
+        int,
+        Meta(
+            ge=0,
+            le=256,
+            description="CPU threads for inference; 0 lets the runtime choose, and lets a recording "
+            "be looked at by two copies of the model with half of the cores each",
+        ),
     ] = 0
     silent_after_s: Annotated[
         float,
@@ -284,7 +290,7 @@ class TrackingConfig(Section, frozen=True):
             "nominal frame; 1, as in the paper's simulation: a track jumps as its boxes do, and "
             "two who close in seem not to",
         ),
-    ] = 0.5
+    ] = 0.35
     speed_window_frames: Annotated[
         int,
         Meta(ge=1, le=60, description="reported velocity is the displacement over these frames"),
