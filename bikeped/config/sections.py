@@ -247,8 +247,8 @@ class DetectionConfig(Section, frozen=True):
         Meta(
             ge=0,
             le=256,
-            description="CPU threads for inference; 0 lets the runtime choose, and lets a recording "
-            "be looked at by two copies of the model with half of the cores each",
+            description="CPU threads for inference; 0 lets the runtime choose, and lets a "
+            "recording be looked at by two copies of the model with half of the cores each",
         ),
     ] = 0
     silent_after_s: Annotated[
