@@ -63,8 +63,8 @@ VALIDATION = DrawnTest(pictures=1200, seed=8_000_001)
 TEST = DrawnTest(pictures=600, seed=9_000_001)
 OTHER_LENSES = replace(TEST, pictures=300, seed=9_500_001, own_lens=True)
 #: The shipped confidence of a kind is the lowest with at most this many false ones a 100 frames on
-#: the validation pictures: half of what is aimed at, for pictures come four to a street, and what is
-#: taken for somebody there is so four times; of cyclists a stricter bound costs next to no recall.
+#: the validation pictures: half of what is aimed at, for pictures come four to a street, and what
+#: is taken for somebody there is so four times. A stricter bound on cyclists costs little recall.
 MOST_FALSE = {Kind.PEDESTRIAN: 0.5, Kind.CYCLIST: 0.1, Kind.VEHICLE: 3.0}
 GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 
