@@ -38,14 +38,14 @@ def card():
 
 def test_it_loads_without_being_told_anything_about_it(loaded):
     detector = load_detector(loaded.config.detection, loaded.base_dir)
-    assert detector.input_size == (1056, 608)
+    assert detector.input_size == (1152, 672)
     assert detector.layout == "yolov8"
     assert detector.family == "ultralytics"
     answer = detector.infer(np.full((540, 960, 3), 120, np.uint8), 1920, 1080)
     assert len(answer.detections) == 0
     # The deployed camera's road is half of its picture, and takes half of the time.
     road = load_detector(loaded.config.detection, loaded.base_dir, road_region(loaded))
-    assert road.input_size == (1056, 320)
+    assert road.input_size == (1152, 352)
 
 
 def test_the_card_is_this_files(card):
