@@ -18,7 +18,6 @@ from bikeped.cli.conformance_pixels import command as pixels
 from bikeped.cli.conformance_shared import (
     begin,
     burst_option,
-    cores,
     curve_option,
     emit,
     optimizer,
@@ -30,6 +29,7 @@ from bikeped.cli.conformance_shared import (
 )
 from bikeped.cli.guard import guarded
 from bikeped.config.candidate import load_decision
+from bikeped.cores import cores
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 

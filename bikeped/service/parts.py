@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 
 import msgspec
 
 from bikeped import __version__
-from bikeped.config import LoadedConfig, road_region
+from bikeped.config import DetectionConfig, LoadedConfig, road_region
+from bikeped.cores import cores
 from bikeped.detection.base import load_detector
 from bikeped.errors import DetectorError
 from bikeped.service.vision import MOST_LOOKS, Eye, ModelEye
@@ -31,21 +31,20 @@ def load_eye(loaded: LoadedConfig, *, recorded: bool = False) -> ModelEye:
             "file there, or with --set detection.model=FILE"
         )
     road = road_region(loaded)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    if not (recorded and cores >= MOST_LOOKS and detection.threads == 0 and _on_cpu(loaded)):
+    threads = cores() // MOST_LOOKS
+    if not (recorded and threads and detection.threads == 0 and _on_cpu(detection)):
         return ModelEye(load_detector(detection, base, road))
-    shared = msgspec.structs.replace(detection, threads=cores // MOST_LOOKS)
+    shared = msgspec.structs.replace(detection, threads=threads)
     return ModelEye(*(load_detector(shared, base, road) for _ in range(MOST_LOOKS)))
 
 
-def _on_cpu(loaded: LoadedConfig) -> bool:
+def _on_cpu(detection: DetectionConfig) -> bool:
     """Whether the processor runs the configured model."""
-    model = loaded.config.detection.model
-    if model is None or model.lower().endswith(".engine"):
+    if str(detection.model).lower().endswith(".engine"):
         return False
     from bikeped.detection.onnx_runtime import runs_on_cpu
 
-    return runs_on_cpu(loaded.config.detection.providers)
+    return runs_on_cpu(detection.providers)
 
 
 def header_of(loaded: LoadedConfig, eye: Eye) -> EventHeader:

@@ -44,7 +44,7 @@ class Eye(Protocol):
 
 
 class ModelEye:
-    """A detector model, in as many copies as pictures are looked at once; each has one thread."""
+    """A detector model, in as many copies as pictures are looked at once."""
 
     def __init__(self, *detectors: Detector) -> None:
         first = detectors[0]

@@ -225,6 +225,13 @@ class Rig:
             self.feed.put(self.clock.now_s, **changes)
             await self.recorder.until(lambda before=before: self.dealt_with() > before)
 
+    def recorded(self, count: int, *, ends: bool = True) -> None:
+        """Puts `count` frames of a recording in, and its end."""
+        for number in range(count):
+            self.feed.put(number / 30)
+        if ends:
+            self.feed.queue.put_nowait(None)
+
     def dealt_with(self) -> int:
         counts = self.loop.counts
         return counts.frames + counts.undecodable + counts.failed + counts.out_of_order

@@ -269,9 +269,7 @@ async def test_a_failure_of_the_feed_ends_the_loop_dark(error):
 
 async def test_a_recording_ends_the_loop_after_its_last_frame():
     async with Rig(live=False) as rig:
-        for n in range(10):
-            rig.feed.put(n / 30)
-        rig.feed.queue.put_nowait(None)
+        rig.recorded(10)
         await rig.ended()
         assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(10))
         assert rig.recorder.ticks == 0  # a recording is not late
@@ -316,9 +314,7 @@ async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
 
     monkeypatch.setattr(loop_module, "Slot", Watched)
     rig.outputs.append(Output())
-    for n in range(10):
-        rig.feed.put(n / 30)
-    rig.feed.queue.put_nowait(None)
+    rig.recorded(10)
     async with rig:
         await rig.ended()
     assert judged == list(range(10))
@@ -349,9 +345,7 @@ async def test_two_looks_at_once_are_judged_in_order(count):
     rig = Rig(live=False)
     rig.eye = PairedEye()
     rig.looks_at_once = 2
-    for n in range(count):
-        rig.feed.put(n / 30)
-    rig.feed.queue.put_nowait(None)
+    rig.recorded(count)
     async with rig:
         await rig.ended()
     assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(count))
@@ -362,8 +356,7 @@ async def test_the_second_of_two_looks_fails_after_the_first_is_judged():
     rig.eye = PairedEye()
     rig.eye.error = DetectorError("out of memory")
     rig.looks_at_once = 2
-    for n in range(10):
-        rig.feed.put(n / 30)
+    rig.recorded(10, ends=False)
     async with rig:
         with pytest.raises(DetectorError, match="out of memory"):
             await rig.ended()
@@ -382,8 +375,7 @@ async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
                 rig.eye.error = DetectorError("out of memory")
 
     rig.outputs.append(Output())
-    for n in range(10):
-        rig.feed.put(n / 30)
+    rig.recorded(10, ends=False)
     async with rig:
         with pytest.raises(DetectorError, match="out of memory"):
             await rig.ended()
@@ -395,8 +387,7 @@ async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
 async def test_frames_before_one_of_other_proportions_are_judged(looks):
     rig = Rig(live=False)
     rig.looks_at_once = looks
-    for n in range(6):
-        rig.feed.put(n / 30)
+    rig.recorded(6, ends=False)
     rig.feed.put(6 / 30, width=64, height=96, rgb=np.zeros((96, 64, 3), np.uint8))
     async with rig:
         with pytest.raises(GeometryError):
@@ -413,8 +404,7 @@ async def test_an_output_that_fails_while_the_eye_hangs_ends_a_replay():
             raise OSError("disk is full")
 
     rig.outputs.append(Output())
-    for n in range(4):
-        rig.feed.put(n / 30)
+    rig.recorded(4, ends=False)
     async with rig:
         with pytest.raises(OSError, match="disk is full"):
             await rig.ended()

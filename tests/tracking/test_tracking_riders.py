@@ -98,9 +98,8 @@ def test_where_riders_are_whole_a_walker_first_taken_for_a_cyclist_is_soon_a_wal
         assert len(kinds(tracker)) == 1  # and there is no ghost of a cyclist
         wrong += kinds(tracker) == {1: C}
     assert kinds(tracker) == {1: P}
-    assert wrong < 2 * wrong_frames + (
-        wrong_frames > 1
-    )  # at two sights that differ, the newer one is right
+    # Of the first two sights the newer one is right.
+    assert wrong < 2 * wrong_frames + (wrong_frames > 1)
 
 
 def test_where_riders_are_whole_the_most_frequent_kind_is_the_tracks():
