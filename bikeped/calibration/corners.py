@@ -6,7 +6,6 @@ finds a whole board, a part of one is looked for (`partial.py`).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from bikeped.calibration.detect_remapped import remapped_candidates
 from bikeped.calibration.partial import partial_board
 from bikeped.calibration.pictures import Picture, check_sizes, load_pictures, pictures_hash
 from bikeped.calibration.views import BoardPattern, BoardView, Found, Refused
+from bikeped.cores import cores
 from bikeped.errors import CalibrationError
 from bikeped.types import FloatArray, ImageArray
 
@@ -68,7 +68,7 @@ def find_boards(
             progress(1)
         return seen
 
-    count = max(1, min(workers or os.cpu_count() or 1, len(loaded)))
+    count = max(1, min(workers or cores(), len(loaded)))
     with ThreadPoolExecutor(count) as pool:
         seen = list(pool.map(look, range(len(loaded))))
     return _sorted_out(loaded, pattern, seen)

@@ -100,7 +100,9 @@ def lighting(conditions: Conditions) -> Lighting:
         top, low = np.array([72.0, 92, 142]), np.array([222.0, 166, 122])
         noise *= 1.5
     elif kind == "night":
-        sun, ambient = np.zeros(3), np.array([0.15, 0.16, 0.21]) * float(rng.uniform(0.75, 1.6))
+        # A crossing is lit, and a camera turns up its gain: in the darkest, too, a person who
+        # looks closely makes everybody out.
+        sun, ambient = np.zeros(3), np.array([0.15, 0.16, 0.21]) * float(rng.uniform(1.2, 1.8))
         top, low, clouds, haze = np.array([10.0, 12, 22]), np.array([38.0, 34, 38]), 0.15, 300.0
         noise *= 2.4
     elif kind == "glare":

@@ -38,7 +38,8 @@ class DrawnPicture:
     objects: list[DrawnObject]
     conditions: Conditions
     camera: SceneCamera
-    furniture: list[tuple[str, Box]]  #: as `ScenePainter.furniture` has it
+    #: As `ScenePainter.furniture` has it, and everybody's `shadow`.
+    furniture: list[tuple[str, Box]]
 
 
 def pictures(
@@ -62,8 +63,10 @@ def pictures(
         view = camera or random_camera(street, size, lens)
         rng = np.random.default_rng((seed, number, 59))
         painter = ScenePainter(random_scenario(seed * 1_000_003 + number, mix), view, conditions)
-        image, objects = painter.draw(float(rng.uniform(0.2, 5.8)))
-        yield DrawnPicture(image, objects, conditions, view, painter.furniture())
+        t_s = float(rng.uniform(0.2, 5.8))
+        image, objects = painter.draw(t_s)
+        things = painter.furniture() + [("shadow", box) for box in painter.shadows(t_s)]
+        yield DrawnPicture(image, objects, conditions, view, things)
 
 
 def write_dataset(

@@ -69,7 +69,7 @@ class ScenePainter:
         }
         self._mask = cv2.merge([self.backdrop.lit.astype(np.uint8) * 255] * 3)
         self._base = self._with_fixtures(standing)
-        self._last: tuple[float, ImageArray, list[DrawnObject]] | None = None
+        self._last: tuple[float, ImageArray, list[DrawnObject], list[Box]] | None = None
 
     def frame(self, t_s: float) -> ImageArray:
         """The picture [h, w, 3] RGB at `t_s` seconds of the scenario."""
@@ -86,12 +86,22 @@ class ScenePainter:
         the like) and its whole silhouette u1, v1, u2, v2, also where somebody hides it."""
         return list(self._furniture)
 
+    def shadows(self, t_s: float) -> list[Box]:
+        """The boxes of the shadows that everybody throws at `t_s`, where the sun shines: they have
+        the shape of somebody and are nobody."""
+        return list(self._drawn(t_s)[3])
+
     def draw(self, t_s: float) -> tuple[ImageArray, list[DrawnObject]]:
         """Picture and objects at once."""
+        _, image, objects, _ = self._drawn(t_s)
+        return image.copy(), list(objects)
+
+    def _drawn(self, t_s: float) -> tuple[float, ImageArray, list[DrawnObject], list[Box]]:
         if self._last is None or self._last[0] != t_s:
             shown = self._present(t_s)
-            self._last = (t_s, self._picture(shown, t_s), self._labels(shown))
-        return self._last[1].copy(), list(self._last[2])
+            image, shadows = self._picture(shown, t_s)
+            self._last = (t_s, image, self._labels(shown), shadows)
+        return self._last
 
     def _present(self, t: float) -> list[_Shown]:
         """Everything that may hide or be hidden, far ones first."""
@@ -128,13 +138,16 @@ class ScenePainter:
             return rider(agent.kind, agent.size_m, looks, number, way, sides)
         return vehicle(agent.kind, agent.size_m, number)
 
-    def _picture(self, shown: list[_Shown], t: float) -> ImageArray:
+    def _picture(self, shown: list[_Shown], t: float) -> tuple[ImageArray, list[Box]]:
         image = self._base.copy()
+        shadows = []
         moving = [item for item in shown if item.mesh is not None]
         for item in moving:
             if item.mesh is not None:
                 spot = item.candidate
-                self._shade(image, item.mesh, spot.xy_m, item.size_m, spot.heading_rad)
+                box = self._shade(image, item.mesh, spot.xy_m, item.size_m, spot.heading_rad)
+                if box is not None:
+                    shadows.append(box)
         drawn: list[Sprite] = []
         for item in shown:
             sprite = item.candidate.sprite
@@ -148,7 +161,7 @@ class ScenePainter:
                     shine(image, self.backdrop, item.mesh.lamps, item.candidate.xy_m)
         self._weather.apply(image, t)
         cv2.bitwise_and(image, self._mask, dst=image)
-        return image
+        return image, shadows
 
     def _with_fixtures(self, standing: list[Standing]) -> ImageArray:
         """The street with everything that stands on it; `standing` far ones first."""
@@ -172,18 +185,23 @@ class ScenePainter:
         xy: FloatArray,
         size_m: tuple[float, float],
         heading: float,
-    ) -> None:
-        """The shadow that the sun throws, and the soft dark patch that lies under everything."""
+    ) -> Box | None:
+        """The shadow that the sun throws (its box is returned), and the soft dark patch that lies
+        under everything."""
         light = self.backdrop.light
+        box = None
         if light.sun.any():
             cast = shadow(
                 mesh.quads, self.camera, light.to_sun, 1 if self.camera.size[0] < 1200 else 2
             )
             if cast is not None:
                 darken(image, self.camera.size, *cast, light.shade)
+                left, top, cover = cast
+                box = (left, top, left + cover.shape[1], top + cover.shape[0])
         patch = footprint(self.camera, xy, size_m, heading)
         if patch is not None:
             darken(image, self.camera.size, *patch, np.array([0.6, 0.6, 0.62]))
+        return box
 
     def _labels(self, shown: list[_Shown]) -> list[DrawnObject]:
         found = label(

@@ -13,6 +13,7 @@ from bikeped.scene.mesh import Lamp
 from bikeped.scene.sprite import Sprite, inside
 from bikeped.types import Float32Array, FloatArray, ImageArray
 
+_EVEN = 0.04  #: vignettes that differ by less within a sprite are taken as one
 _RING = np.linspace(0, 2 * np.pi, 17)[:-1]
 
 
@@ -24,7 +25,6 @@ def paste(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
         return
     rows, columns, patch_rows, patch_columns = spot
     part = image[rows, columns]
-    middle = street.vignette[(rows.start + rows.stop) // 2, (columns.start + columns.stop) // 2]
     alpha = sprite.alpha[patch_rows, patch_columns]
     kept = cv2.multiply(part, cv2.merge([255 - alpha] * 3), scale=1 / 255)
     colour = sprite.colour[patch_rows, patch_columns]
@@ -33,6 +33,13 @@ def paste(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
         low = street.light.sky_low.astype(np.float32)
         pale = alpha[..., None].astype(np.float32) / 255 * low * haze
         colour = np.asarray(colour * (1 - haze) + pale, np.uint8)
+    shade = street.vignette[rows, columns]
+    if float(shade.max() - shade.min()) > _EVEN:
+        # Near the rim: who is half beyond it must not be as black there as on the other half.
+        colour = np.asarray(cv2.multiply(colour, cv2.merge([shade] * 3), dtype=cv2.CV_8U), np.uint8)
+        part[:] = cv2.add(kept, colour)
+        return
+    middle = shade[shade.shape[0] // 2, shade.shape[1] // 2]
     part[:] = cv2.addWeighted(kept, 1.0, colour, float(middle), 0)
 
 

@@ -263,24 +263,29 @@ class Loop:
     def _begin_looks(self, slot: Slot, free: list[Worker], looks: deque[_Look]) -> None:
         """Hands what waits to whoever has nothing to look at."""
         while free and (picture := slot.take()) is not None:
-            frame = picture.frame
-            try:
-                self._judge.framing_of(frame.width, frame.height)
-            except GeometryError as error:
-                if self._feed.live:
-                    self._geometry_fault = f"geometry: {error}"
+            misfit = self._misfit(picture.frame)
+            if self._feed.live:
+                self._geometry_fault = None if misfit is None else f"geometry: {misfit}"
+                if misfit is not None:
                     self._show()
                     continue
-                # Ends the replay when the frames before it are judged.
-                answer: asyncio.Future[DetectorAnswer] = asyncio.get_running_loop().create_future()
-                answer.set_exception(error)
-                looks.append(_Look(picture, free.pop(), time.perf_counter(), answer))
-                continue
-            self._geometry_fault = None
             worker, began_s = free.pop(), time.perf_counter()
-            answer = worker.submit(self._vision.see, picture)
+            if misfit is None:
+                answer = worker.submit(self._vision.see, picture)
+            else:
+                # Ends the replay when the frames before it are judged.
+                answer = asyncio.get_running_loop().create_future()
+                answer.set_exception(misfit)
             looks.append(_Look(picture, worker, began_s, answer))
             self._looking_since_s = looks[0].began_s
+
+    def _misfit(self, frame: Frame) -> GeometryError | None:
+        """Why a frame of this size has no place on the ground, or None."""
+        try:
+            self._judge.framing_of(frame.width, frame.height)
+        except GeometryError as error:
+            return error
+        return None
 
     def _answer(self, look: _Look) -> DetectorAnswer | None:
         """What the eye says of a picture; None when a live one could not be looked at."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
 from pathlib import Path
@@ -69,6 +68,7 @@ def _searches(figures: Figures, suite: Suite, loaded: LoadedConfig, one_pass_s: 
     """
     from bikeped.conformance import optimizer
     from bikeped.conformance.reproduce import Settings, reproduce
+    from bikeped.cores import cores
 
     count = optimizer.evaluations()
     began = time.perf_counter()
@@ -78,6 +78,6 @@ def _searches(figures: Figures, suite: Suite, loaded: LoadedConfig, one_pass_s: 
     trials = Settings().trials
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        reproduce(suite, loaded, Path(folder), processes=os.cpu_count() or 1)
+        reproduce(suite, loaded, Path(folder), processes=cores())
         took = time.perf_counter() - began
     figures.add(f"reproduce everything, {trials} trials, with figures", took, None, "s", "60")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -27,7 +28,9 @@ from bikeped.scene import (
 )
 from bikeped.scene.backdrop import backdrop
 from bikeped.scene.camera import rays
+from bikeped.scene.paste import paste
 from bikeped.scene.place import place
+from bikeped.scene.sprite import Sprite
 from bikeped.types import ImageArray
 
 SIZE = (320, 180)
@@ -70,6 +73,35 @@ def test_furniture_is_where_it_is_drawn(view: SceneCamera, scenario: Scenario) -
         rows = slice(max(int(v1), 0), int(v2) + 1)
         columns = slice(max(int(u1), 0), int(u2) + 1)
         assert np.abs(full - bare)[rows, columns].max() > 8, what
+
+
+def test_shadows_lie_where_it_is_darker(view: SceneCamera, scenario: Scenario) -> None:
+    painter = ScenePainter(scenario, view, Conditions(noise=0.0))
+    shadows = painter.shadows(5.0)
+    assert len(shadows) >= len(painter.objects(5.0)) / 2
+    street = backdrop(view, painter.conditions).image.astype(int)
+    image = painter.frame(5.0).astype(int)
+    for u1, v1, u2, v2 in shadows:
+        spot = (slice(max(int(v1), 0), int(v2)), slice(max(int(u1), 0), int(u2)))
+        assert (street - image)[spot].max() > 25
+    assert ScenePainter(scenario, view, Conditions(light="night")).shadows(5.0) == []
+
+
+@pytest.mark.parametrize("middle_u", [19, 160])
+def test_a_figure_is_as_dark_as_the_lens_is_at_each_of_its_pixels(
+    view: SceneCamera, middle_u: int
+) -> None:
+    """Also across the rim, where the lens is dark at the figure's middle and bright at its side."""
+    street = backdrop(view, Conditions())
+    spot = (slice(120, 150), slice(middle_u - 15, middle_u + 15))
+    whole = np.full((30, 30), 255, np.uint8)
+    figure = Sprite(spot[1].start, 120, cv2.merge([whole - 55] * 3), whole, (0, 0, 1, 1), 1.0)
+    image = np.zeros((*SIZE[::-1], 3), np.uint8)
+    paste(image, street, figure)
+    assert np.abs(image[spot] - 200.0 * street.vignette[spot][..., None]).max() < 10
+    assert image[spot].max() > 100
+    assert (image[spot].min() < 5) == (middle_u == 19)
+    assert image.sum() == image[spot].sum()
 
 
 def test_a_picture_is_the_callers_own(view: SceneCamera, scenario: Scenario) -> None:
