@@ -155,6 +155,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
             "commit": commit(),
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             "seed_data": TRAINING.seed,
+            "configured_share": TRAINING.configured,
             "usual_mix": asdict(USUAL_MIX),
             "most_false": {kind.label: most for kind, most in MOST_FALSE.items()},
             "drawing": read(out / "drawing.json"),
