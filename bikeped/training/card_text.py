@@ -29,14 +29,14 @@ doctor` say so where it is configured.
 ## What it was trained on
 
 {pictures} pictures drawn by `bikeped.scene` ({objects} objects), and nothing else: no photograph,
-no other network's weights. {configured:.0%} were seen by the configured camera from varied spots, the
+no other network's weights. Seven tenths were seen by the configured camera from varied spots, the
 others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 to 5.5 m high).
 There is more of what is hard to tell than in the streets it is measured on: {mix}.
 
 | | |
 | --- | --- |
 | command | `{command}` |
-| sources | bikeped {bikeped}, commit {commit} |
+| sources | bikeped {bikeped}, commit {commit}{measured} |
 | seeds | pictures {seed_data}, training {seed}; validation and tests from seeds of their own |
 | drawing | {drawing_min:.0f} min{drawing_note} |
 | training | {steps} steps, {training_min:.0f} min |
@@ -88,9 +88,9 @@ def card_text(card: Mapping[str, Any]) -> str:
         command=made["command"],
         bikeped=made["bikeped"],
         commit=made["commit"],
+        measured=f"; measured with commit {made['measured']}" if "measured" in made else "",
         seed_data=made["seed_data"],
         seed=settings["seed"],
-        configured=made["configured_share"],
         mix=_mix(made["drawing"]["mix"], made["usual_mix"]),
         drawing_min=made["drawing"]["seconds"] / 60,
         drawing_note=made["drawing"].get("note", ""),
