@@ -88,7 +88,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         command=made["command"],
         bikeped=made["bikeped"],
         commit=made["commit"],
-        measured=f"; measured with commit {made['measured']}" if "measured" in made else "",
+        measured=_measured_by(made),
         seed_data=made["seed_data"],
         seed=settings["seed"],
         mix=_mix(made["drawing"]["mix"], made["usual_mix"]),
@@ -122,6 +122,12 @@ def card_text(card: Mapping[str, Any]) -> str:
     if "experiment" in card:
         text += "\n" + _experiment(card["experiment"])
     return text
+
+
+def _measured_by(made: Mapping[str, Any]) -> str:
+    if "measured" not in made:
+        return ""
+    return f"; measured with commit {made['measured']}, on pictures as they are drawn there"
 
 
 def _mix(mine: Mapping[str, float], usual: Mapping[str, float]) -> str:
