@@ -37,6 +37,16 @@ class _Shown:
     size_m: tuple[float, float] = (0.5, 0.5)
 
 
+@dataclass(frozen=True)
+class _Moment:
+    """What was drawn at `t_s`."""
+
+    t_s: float
+    image: ImageArray
+    objects: list[DrawnObject]
+    shadows: list[Box]
+
+
 class ScenePainter:
     """Draws one scenario for one camera and one set of conditions.
 
@@ -69,7 +79,7 @@ class ScenePainter:
         }
         self._mask = cv2.merge([self.backdrop.lit.astype(np.uint8) * 255] * 3)
         self._base = self._with_fixtures(standing)
-        self._last: tuple[float, ImageArray, list[DrawnObject], list[Box]] | None = None
+        self._last: _Moment | None = None
 
     def frame(self, t_s: float) -> ImageArray:
         """The picture [h, w, 3] RGB at `t_s` seconds of the scenario."""
@@ -77,8 +87,8 @@ class ScenePainter:
 
     def objects(self, t_s: float) -> list[DrawnObject]:
         """Everybody who is to be seen at `t_s`: agents in their order, then parked cars."""
-        if self._last is not None and self._last[0] == t_s:
-            return list(self._last[2])
+        if self._last is not None and self._last.t_s == t_s:
+            return list(self._last.objects)
         return self._labels(self._present(t_s))
 
     def furniture(self) -> list[tuple[str, Box]]:
@@ -89,18 +99,18 @@ class ScenePainter:
     def shadows(self, t_s: float) -> list[Box]:
         """The boxes of the shadows that everybody throws at `t_s`, where the sun shines: they have
         the shape of somebody and are nobody."""
-        return list(self._drawn(t_s)[3])
+        return list(self._moment(t_s).shadows)
 
     def draw(self, t_s: float) -> tuple[ImageArray, list[DrawnObject]]:
         """Picture and objects at once."""
-        _, image, objects, _ = self._drawn(t_s)
-        return image.copy(), list(objects)
+        moment = self._moment(t_s)
+        return moment.image.copy(), list(moment.objects)
 
-    def _drawn(self, t_s: float) -> tuple[float, ImageArray, list[DrawnObject], list[Box]]:
-        if self._last is None or self._last[0] != t_s:
+    def _moment(self, t_s: float) -> _Moment:
+        if self._last is None or self._last.t_s != t_s:
             shown = self._present(t_s)
             image, shadows = self._picture(shown, t_s)
-            self._last = (t_s, image, self._labels(shown), shadows)
+            self._last = _Moment(t_s, image, self._labels(shown), shadows)
         return self._last
 
     def _present(self, t: float) -> list[_Shown]:

@@ -33,14 +33,13 @@ def paste(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
         low = street.light.sky_low.astype(np.float32)
         pale = alpha[..., None].astype(np.float32) / 255 * low * haze
         colour = np.asarray(colour * (1 - haze) + pale, np.uint8)
-    shade = street.vignette[rows, columns]
-    if float(shade.max() - shade.min()) > _EVEN:
-        # Near the rim: who is half beyond it must not be as black there as on the other half.
-        colour = np.asarray(cv2.multiply(colour, cv2.merge([shade] * 3), dtype=cv2.CV_8U), np.uint8)
-        part[:] = cv2.add(kept, colour)
-        return
-    middle = shade[shade.shape[0] // 2, shade.shape[1] // 2]
-    part[:] = cv2.addWeighted(kept, 1.0, colour, float(middle), 0)
+    vignette = street.vignette[rows, columns]
+    gain = float(vignette[vignette.shape[0] // 2, vignette.shape[1] // 2])
+    if float(vignette.max() - vignette.min()) > _EVEN:
+        # Near the rim: who is half beyond it must not be as black on this side as on that one.
+        lit = cv2.multiply(colour, cv2.merge([vignette] * 3), dtype=cv2.CV_8U)
+        colour, gain = np.asarray(lit, np.uint8), 1.0
+    part[:] = cv2.addWeighted(kept, 1.0, colour, gain, 0)
 
 
 def darken(
