@@ -165,8 +165,8 @@ def test_configurations_side_by_side(testbench, until):
     page.select_option("#configuration", "narrow")
     settled(page)
     expect(rows.nth(0)).to_contain_text("Narrow")
-    # The address is written a moment after the change; that of the first change holds no "narrow".
-    until(page, "location.hash.includes('beside') && location.hash.includes('narrow')")
+    # The address is written a moment after a change: that of the last one holds its distance.
+    until(page, "location.hash.includes('beside') && location.hash.includes('decision.d_max_m')")
     again = testbench(page.url.partition("#")[2])
     expect(again.locator("#figures tbody tr")).to_have_count(3)
     assert again.locator("#figures").inner_text() == page.locator("#figures").inner_text()
