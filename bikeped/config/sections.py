@@ -206,6 +206,15 @@ class DetectionConfig(Section, frozen=True):
         float,
         Meta(ge=0.01, le=1, description="overlap above which the weaker of one class is dropped"),
     ] = 0.45
+    merge_overlap: Annotated[
+        float,
+        Meta(
+            ge=0.5,
+            le=1,
+            description="a box that is kept becomes the mean, weighted by confidence, of those of "
+            "its kind that overlap it this much, which trembles less; 1 leaves every box as it is",
+        ),
+    ] = 0.75
     max_detections: Annotated[
         int, Meta(ge=1, le=10000, description="most detections kept of one frame")
     ] = 300

@@ -20,7 +20,7 @@ from bikeped.detection.classes import UNMAPPED, class_names, kind_table, riders_
 from bikeped.detection.facts import ModelMetadata
 from bikeped.detection.halves import drop_halves
 from bikeped.detection.layouts import Candidates, Layout, choose_layout, decode, pick_output
-from bikeped.detection.nms import suppress
+from bikeped.detection.nms import merge, suppress
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.detection.riders import join_riders
 from bikeped.detection.weights import first_layer
@@ -221,8 +221,9 @@ class NetworkDetector:
         on_frame = np.nonzero((box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1]))[0]
         kind, score, box = kind[on_frame], score[on_frame], box[on_frame]
         keep = self._suppress(box, score, kind)
+        steady = merge(box, score, kind, keep, self._config.merge_overlap)
         joined = join_riders(
-            drop_halves(Detections(kind[keep], score[keep], box[keep])),
+            drop_halves(Detections(kind[keep], score[keep], steady)),
             self._rider_overlap,
             self._config.confidence,
         )

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.detection.nms import overlap_matrix, suppress
+from bikeped.detection.nms import merge, overlap_matrix, suppress
 
 
 def plain(box, score, group, iou, most):
@@ -86,3 +86,45 @@ def test_most_is_the_strongest():
     box = np.array([[20 * i, 0, 20 * i + 10, 10] for i in range(500)], np.float32)
     score = np.linspace(0.1, 0.9, 500).astype(np.float32)
     assert suppress(box, score, np.zeros(500), 0.5, 3).tolist() == [499, 498, 497]
+
+
+def plainly_merged(box, score, group, keep, overlap):
+    """One kept box at a time, one neighbour at a time."""
+    rows = []
+    for i in keep:
+        near = [
+            k
+            for k in range(len(box))
+            if k == i or (group[k] == group[i] and one_overlap(box[i], box[k]) >= overlap)
+        ]
+        rows.append(np.average(box[near].astype(float), axis=0, weights=score[near].astype(float)))
+    return np.array(rows).reshape(-1, 4)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 120), st.integers(1, 5), st.floats(0.5, 0.99))
+def test_merging_equals_the_plain_loop(seed, n, crowd, overlap):
+    box, score, group = scene(n, seed, crowd=crowd)
+    keep = suppress(box, score, group, 0.45, 50)
+    merged = merge(box, score, group, keep, overlap)
+    np.testing.assert_allclose(
+        merged, plainly_merged(box, score, group, keep, overlap), rtol=1e-4, atol=1e-3
+    )
+    # Whoever is moved, is moved within what was boxed there.
+    assert (overlap_matrix(merged, box[keep]).diagonal() >= overlap**2 - 1e-4).all()
+
+
+def test_merging_takes_the_stronger_more_into_account_and_other_kinds_not_at_all():
+    box = np.array([[0, 0, 10, 20], [0, 0, 10, 24], [0, 0, 10, 18]], np.float32)
+    score = np.array([0.6, 0.2, 0.5], np.float32)
+    kept = merge(box, score, np.array([0, 0, 1]), np.array([0, 2]), 0.75)
+    np.testing.assert_allclose(kept, [[0, 0, 10, 21], [0, 0, 10, 18]], rtol=1e-6)
+
+
+def test_nothing_is_merged_at_one_and_a_box_without_area_stays():
+    box, score, group = scene(60, seed=3)
+    keep = suppress(box, score, group, 0.45, 50)
+    assert np.array_equal(merge(box, score, group, keep, 1.0), box[keep])
+    flat = np.array([[5, 5, 5, 5]], np.float32)
+    one = merge(flat, np.ones(1, np.float32), np.zeros(1), np.zeros(1, np.int64), 0.75)
+    assert one.tolist() == flat.tolist()
