@@ -104,7 +104,7 @@ def lighting(conditions: Conditions) -> Lighting:
         # looks closely makes everybody out.
         sun, ambient = np.zeros(3), np.array([0.15, 0.16, 0.21]) * float(rng.uniform(1.2, 1.8))
         top, low, clouds, haze = np.array([10.0, 12, 22]), np.array([38.0, 34, 38]), 0.15, 300.0
-        noise *= 2.4
+        noise *= 1.7
     elif kind == "glare":
         # In the picture: within 50 degrees of north, where the usual camera looks, and low.
         azimuth = math.radians(90 + float(rng.uniform(-50, 50)))

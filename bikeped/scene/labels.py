@@ -66,7 +66,7 @@ def label(
 ) -> list[DrawnObject]:
     """Objects of the `candidates` that have a kind, far ones first as given, as far as they show.
 
-    `lit` [h, w]: where the lens reaches.
+    `lit` [h, w]: where the lens reaches, and lets light enough through to see by.
     """
     left: list[Float32Array | None] = []
     for i, near in enumerate(candidates):

@@ -25,6 +25,8 @@ from bikeped.types import FloatArray, ImageArray
 _PATH_CLEAR_M = 1.1  #: fixtures nearer than this to somebody's path are left out
 _ROUND_PX = 90.0  #: figures smaller than this need no round limbs
 _USUAL = Conditions()
+#: Of the light in the middle of the picture: less, in the black of the lens' rim, shows nobody.
+_LEAST_LIGHT = 0.15
 Box = tuple[float, float, float, float]  #: u1, v1, u2, v2 in pixels of the picture
 
 
@@ -78,6 +80,7 @@ class ScenePainter:
             for agent in scenario.agents
         }
         self._mask = cv2.merge([self.backdrop.lit.astype(np.uint8) * 255] * 3)
+        self._seen = self.backdrop.lit & (self.backdrop.vignette >= _LEAST_LIGHT)
         self._base = self._with_fixtures(standing)
         self._last: _Moment | None = None
 
@@ -216,7 +219,7 @@ class ScenePainter:
     def _labels(self, shown: list[_Shown]) -> list[DrawnObject]:
         found = label(
             [item.candidate for item in shown],
-            self.backdrop.lit,
+            self._seen,
             self.camera.pose,
             self.camera.size,
         )

@@ -104,6 +104,28 @@ def test_a_figure_is_as_dark_as_the_lens_is_at_each_of_its_pixels(
     assert image.sum() == image[spot].sum()
 
 
+def test_who_stands_in_the_black_of_the_rim_shows_in_part(view: SceneCamera) -> None:
+    """Where the lens lets next to no light through, somebody counts only as far as he is lit."""
+    light = rays(view).vignette * rays(view).lit
+    v, u = np.nonzero((light > 0) & (light < 0.15))
+    xy, valid = view.camera.ground(view.framing.frame_to_crop(np.stack([u, v], 1) + 0.5))
+    near = valid & (np.hypot(*xy.T) < 8)
+    spots = view.pose.ground_to_world(xy[near])[:: max(1, near.sum() // 12)]
+    shares = []
+    for x, y in spots.tolist():
+        stands = np.array([[0.0, x, y], [20.0, x + 0.05, y]])
+        nobody_else = Scenario(
+            "rim", "safe", "idle", "bicycle", (Agent(1, "pedestrian", stands, (0.25, 0.4, 1.1)),)
+        )
+        for item in ScenePainter(nobody_else, view, Conditions()).objects(5.0):
+            if item.id == 1:
+                u1, v1, u2, v2 = (round(side) for side in item.box_px)
+                assert light[v1:v2, u1:u2].max() >= 0.15, item
+                shares.append(item.visible)
+    assert len(shares) > 10
+    assert np.mean(shares) < 0.9  # all of them have their feet in the dark
+
+
 def test_a_picture_is_the_callers_own(view: SceneCamera, scenario: Scenario) -> None:
     painter = ScenePainter(scenario, view)
     image, objects = painter.draw(4.0)
