@@ -29,8 +29,8 @@ doctor` say so where it is configured.
 ## What it was trained on
 
 {pictures} pictures drawn by `bikeped.scene` ({objects} objects), and nothing else: no photograph,
-no other network's weights. Seven tenths were seen by the configured camera from varied spots, the
-others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 to 5.5 m high).
+no other network's weights. {configured:.0%} were seen by the configured camera from varied spots,
+the others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 to 5.5 m high).
 There is more of what is hard to tell than in the streets it is measured on: {mix}.
 
 | | |
@@ -91,6 +91,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         measured=_measured_by(made),
         seed_data=made["seed_data"],
         seed=settings["seed"],
+        configured=made["configured_share"],
         mix=_mix(made["drawing"]["mix"], made["usual_mix"]),
         drawing_min=made["drawing"]["seconds"] / 60,
         drawing_note=made["drawing"].get("note", ""),

@@ -23,7 +23,7 @@ from bikeped.types import FloatArray, ImageArray, IntArray
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
 _LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
 _WHOLE = 0.97  #: of an object that shows, or it is hidden in part
-_TURNS_OF_HIDDEN = 2
+_TURNS_OF_HIDDEN = 4
 LARGEST_WINDOW_PX = 256  #: of those whose size is asked for one by one
 _NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest in grey levels
 
