@@ -17,9 +17,9 @@ import torch
 from bikeped.training.network import boxes_px
 
 _SCORE_POWER, _OVERLAP_POWER = 0.5, 6.0  #: of the alignment: score^0.5 * overlap^6
-#: A score is asked to be the overlap to this power: tiny objects are never boxed as well as large
-#: ones, and must not be doubted for it.
-_TARGET_POWER = 0.35
+#: A score is asked to be the overlap to this power: who is tiny, or half hidden, is never boxed as
+#: well as others, and must not be doubted for it.
+_TARGET_POWER = 0.15
 _CELLS_AN_OBJECT = 10
 _LEAST_REACH_PX = 8.0  #: cells this far from the middle of a tiny object may answer for it
 _EDGE_WEIGHTS = (0.5, 0.5, 0.5, 1.5)  #: left, top, right, bottom

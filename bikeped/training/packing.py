@@ -37,7 +37,7 @@ class PackSettings:
     #: How often objects that need 1, 2, 3, 4 blocks are taken: the largest are the easiest.
     taken: tuple[float, ...] = (1.0, 1.0, 0.85, 0.65)
     #: Share of each of the first classes; further ones share what is left.
-    classes: tuple[float, ...] = (0.48, 0.42)
+    classes: tuple[float, ...] = (0.5, 0.42)
 
 
 @dataclass(frozen=True)
