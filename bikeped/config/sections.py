@@ -299,7 +299,7 @@ class TrackingConfig(Section, frozen=True):
             "nominal frame; 1, as in the paper's simulation: a track jumps as its boxes do, and "
             "two who close in seem not to",
         ),
-    ] = 0.25
+    ] = 0.2
     speed_window_frames: Annotated[
         int,
         Meta(ge=1, le=60, description="reported velocity is the displacement over these frames"),
