@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -22,8 +23,10 @@ from playwright.sync_api import Browser, Page, sync_playwright
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(Path(__file__).parent))
 
+Scheme = Literal["light", "dark"]
+
 SIZES = {"desktop": (1440, 900, 1.0), "phone": (390, 844, 2.0)}
-SCHEMES = ("light", "dark")
+SCHEMES: tuple[Scheme, ...] = ("light", "dark")
 QUALITY = 80
 PATIENCE_MS = 300_000  #: on a busy machine everything comes late
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
@@ -37,7 +40,7 @@ class Studio:
         self.work = work  #: a folder for clips and the like
 
     @contextmanager
-    def page(self, url: str, size: str, scheme: str) -> Iterator[Page]:
+    def page(self, url: str, size: str, scheme: Scheme) -> Iterator[Page]:
         """`url` in a fresh context of the given look."""
         width, height, scale = SIZES[size]
         context = self._browser.new_context(
@@ -61,7 +64,7 @@ class Studio:
         url: str,
         ready: Callable[[Page], None],
         sizes: tuple[str, ...] = tuple(SIZES),
-        schemes: tuple[str, ...] = SCHEMES,
+        schemes: tuple[Scheme, ...] = SCHEMES,
         whole: tuple[str, ...] = ("phone",),
     ) -> None:
         """Pictures of `url` in each look, taken when `ready(page)` returns; of the whole page, not

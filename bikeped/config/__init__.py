@@ -16,14 +16,8 @@ from bikeped.config.load import (
     load_config,
     parse_config,
 )
-from bikeped.config.sections import (
-    CameraConfig,
-    Config,
-    DecisionConfig,
-    DetectionConfig,
-    LatencyConfig,
-    TrackingConfig,
-)
+from bikeped.config.sections import CameraConfig, Config, DetectionConfig
+from bikeped.config.sections_judge import DecisionConfig, LatencyConfig, TrackingConfig
 from bikeped.config.sections_output import (
     AuditConfig,
     FeedbackConfig,

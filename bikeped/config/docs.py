@@ -16,7 +16,7 @@ _INTRO = """\
 # Configuration
 
 <!-- Made by `python -m bikeped.config.docs docs/configuration.md` from bikeped/config/sections.py;
-     change the descriptions there. -->
+     and the two beside it; change the descriptions there. -->
 
 Every key of `config.yaml`, in the order of the file. A key that is left out has its default; a
 key that is not listed here stops the start with its name and the nearest known one. A key may

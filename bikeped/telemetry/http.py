@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import msgspec
 from aiohttp import web
+from aiohttp.http import HttpProcessingError
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
@@ -16,6 +17,7 @@ from bikeped.config import WebConfig
 from bikeped.telemetry.messages import ShownState
 
 log = logging.getLogger(__name__)
+_requests_log = log.getChild("requests")
 
 Health = Callable[[], Mapping[str, Any]]
 
@@ -83,6 +85,7 @@ class HttpServer:
         runner = web.AppRunner(
             self._app,
             access_log=None,  # a scrape every few seconds for months is not news
+            logger=_requests_log,
             shutdown_timeout=1.0,
             keepalive_timeout=IDLE_S,
             lingering_time=_LINGER_S,
@@ -132,6 +135,15 @@ class HttpServer:
             connection.abort()
         for _ in range(_TURNS_TO_ACCEPT):  # in which they are let go
             await asyncio.sleep(0)
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """What is no request (a port scan, an address of 9 kB) is answered with status 400. In a
+    journal of months it is no news, and a trace of it would hide what is."""
+    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
+
+
+_requests_log.addFilter(_is_news)
 
 
 class _TurnAway(asyncio.Protocol):

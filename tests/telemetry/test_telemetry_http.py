@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -97,6 +98,35 @@ async def test_a_health_report_that_fails_is_a_fault(serve, caplog):
         assert response.status == 503
         assert (await response.json())["state"] == "FAULT"
     assert "a bug" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "rubbish",
+    [
+        b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n: no name\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\r\n\r\n",
+    ],
+    ids=["long address", "header without a name", "TLS"],
+)
+async def test_what_is_no_request_is_refused_without_a_word_in_the_log(serve, caplog, rubbish):
+    url = await serve(make_app(Metrics().registry, dict))
+    reader, writer = await asyncio.open_connection("127.0.0.1", int(url.rpartition(":")[2]))
+    writer.write(rubbish)
+    assert b" 400 " in await reader.readline()
+    writer.close()
+    await writer.wait_closed()
+    assert [r for r in caplog.records if r.levelno >= logging.WARNING] == []
+
+
+async def test_a_fault_of_a_page_is_in_the_log(serve, caplog):
+    async def faulty(_request: web.Request) -> web.Response:
+        raise KeyError("a bug of ours")
+
+    app = make_app(Metrics().registry, dict)
+    app.router.add_get("/faulty", faulty)
+    assert (await get(await serve(app) + "/faulty"))[0] == 500
+    assert "a bug of ours" in caplog.text
 
 
 async def test_more_connections_than_allowed_are_turned_away_and_room_is_used_again():
