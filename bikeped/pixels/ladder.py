@@ -40,8 +40,7 @@ def ladder(
     suite: Suite, runs: Sequence[PixelRun], loaded: LoadedConfig, decision: DecisionConfig
 ) -> list[Rung]:
     """The rungs from scripted positions to the deployed loop, over all scenarios of `suite`."""
-    judge = Judge(loaded)
-    judge.expect(riders_whole=all(run.riders_whole for run in runs))
+    judge = Judge(loaded, riders_whole=all(run.riders_whole for run in runs))
     seen = suite.seen
 
     def points(present: Callable[[PixelRun, int, int], bool]) -> States:

@@ -12,7 +12,7 @@ from bikeped.config import LoadedConfig
 from bikeped.conformance.perception import Seen
 from bikeped.pixels.matching import MIN_VISIBLE, match
 from bikeped.pixels.run import PixelRun
-from bikeped.service.judge import Judge
+from bikeped.service.viewpoint import Viewpoint
 from bikeped.types import Detections, FloatArray, Kind
 
 #: Bounds of the distance rings, metres from the camera.
@@ -41,13 +41,13 @@ class Sights:
 
 def sights(runs: Sequence[PixelRun], seen: Sequence[Seen], loaded: LoadedConfig) -> Sights:
     """What there was to see in `runs`, and what became of it."""
-    judge = Judge(loaded)
+    viewpoint = Viewpoint(loaded)
     rows: list[tuple[float, ...]] = []
     false = dict.fromkeys(Kind, 0)
     frames = 0
     for run, script in zip(runs, seen, strict=True):
         column = {agent.id: i for i, agent in enumerate(run.scenario.agents)}
-        framing = judge.framing_of(run.width, run.height)
+        framing = viewpoint.framing_of(run.width, run.height)
         for frame, (objects, detections) in enumerate(
             zip(run.objects, run.detections, strict=True)
         ):
@@ -55,13 +55,13 @@ def sights(runs: Sequence[PixelRun], seen: Sequence[Seen], loaded: LoadedConfig)
             matched = match(detections, objects)
             for kind in detections.kind[matched.object < 0].tolist():
                 false[Kind(kind)] += 1
-            found_xy = _on_ground(judge, framing.frame_to_crop(detections.bottom_centre_px()))
+            found_xy = _on_ground(viewpoint, framing.frame_to_crop(detections.bottom_centre_px()))
             boxes = Detections(
                 np.zeros(len(objects), np.int8),
                 np.ones(len(objects), np.float32),
                 np.asarray([o.box_px for o in objects], np.float32).reshape(-1, 4),
             )
-            exact_xy = _on_ground(judge, framing.frame_to_crop(boxes.bottom_centre_px()))
+            exact_xy = _on_ground(viewpoint, framing.frame_to_crop(boxes.bottom_centre_px()))
             for index, item in enumerate(objects):
                 if item.visible < MIN_VISIBLE or item.id not in column:
                     continue  # hidden; or a parked car, which no scenario knows
@@ -81,9 +81,9 @@ def sights(runs: Sequence[PixelRun], seen: Sequence[Seen], loaded: LoadedConfig)
     return Sights(frames, false, *table.T)
 
 
-def _on_ground(judge: Judge, crop_px: FloatArray) -> FloatArray:
+def _on_ground(viewpoint: Viewpoint, crop_px: FloatArray) -> FloatArray:
     """[n, 2] places of bottom centres; NaN where they lie on no ground."""
-    xy, valid = judge.table.lookup(crop_px)
+    xy, valid = viewpoint.table.lookup(crop_px)
     return np.asarray(np.where(valid[:, None], xy, np.nan))
 
 

@@ -64,8 +64,7 @@ def run_scenario(
     painter = ScenePainter(scenario, scene_camera(loaded, size), conditions)
     source = DrawnSource(painter, scenario.name, scenario.frame_times(FPS).tolist(), FPS)
     kept = _Kept()
-    judge = Judge(loaded)
-    judge.expect(riders_whole=looking.riders_whole)
+    judge = Judge(loaded, riders_whole=looking.riders_whole)
 
     async def through() -> None:
         loop = Loop(

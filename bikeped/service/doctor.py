@@ -32,8 +32,8 @@ from bikeped.feedback import open_light
 from bikeped.feedback.light import LAMP_COLOURS
 from bikeped.feedback.sounds import make_wav
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
-from bikeped.service.judge import Judge
 from bikeped.service.parts import load_eye
+from bikeped.service.viewpoint import Viewpoint
 from bikeped.service.vision import Picture
 from bikeped.telemetry.mqtt_auth import load_credentials
 from bikeped.types import Frame, Sound
@@ -111,7 +111,7 @@ def _bounded(check: Check, loaded: LoadedConfig) -> Finding:
 
 def check_configuration(loaded: LoadedConfig) -> Finding:
     """Whether lens, framing and ground fit together."""
-    camera = Judge(loaded).camera
+    camera = Viewpoint(loaded).camera
     return Finding(
         "configuration",
         "ok",
@@ -129,7 +129,7 @@ def check_camera(loaded: LoadedConfig) -> Finding:
     except CaptureError as error:
         return _held_by_service("camera", *_split(str(error)))
     last = frames[-1]
-    Judge(loaded).framing_of(last.width, last.height)
+    Viewpoint(loaded).framing_of(last.width, last.height)
     began = time.perf_counter()
     if last.jpeg is not None:
         JpegDecoder().decode(last.jpeg)

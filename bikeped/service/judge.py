@@ -10,17 +10,9 @@ import math
 import time
 from dataclasses import dataclass
 
-import numpy as np
-
-from bikeped.config import (
-    LoadedConfig,
-    framing,
-    ground_camera,
-    rule_settings,
-    tracker_settings,
-)
+from bikeped.config import LoadedConfig, rule_settings, tracker_settings
 from bikeped.decision import Decider
-from bikeped.geometry import Framing, GroundTable
+from bikeped.service.viewpoint import Viewpoint
 from bikeped.tracking import Tracker, predict
 from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 
@@ -44,32 +36,29 @@ class Judgement:
 class Judge:
     """Judges frames in order of their capture times."""
 
-    def __init__(self, loaded: LoadedConfig) -> None:
+    def __init__(
+        self,
+        loaded: LoadedConfig,
+        *,
+        riders_whole: bool = False,
+        viewpoint: Viewpoint | None = None,
+    ) -> None:
+        """`riders_whole`: of the detector (`Detector.riders_whole`). `viewpoint`: that of `loaded`,
+        where it has been made already."""
         config = loaded.config
         fps = config.decision.nominal_fps
-        self._config, self._fps = config, fps
-        self.sensor_framing = framing(loaded)
-        self.camera = ground_camera(loaded)
-        self.table = GroundTable(
-            self.camera, *self.sensor_framing.crop_wh, step_px=config.camera.table_step_px
+        self.viewpoint = viewpoint or Viewpoint(loaded)
+        self._tracker_settings = tracker_settings(
+            config.tracking,
+            fps,
+            acceleration=config.latency.order == 2,
+            riders_whole=riders_whole,
         )
         self._speed_window_s = config.tracking.speed_window_frames / fps
         self._history = config.tracking.history_frames
-        self._max_range_m = config.tracking.max_range_m
         self._rule = rule_settings(config.decision)
         self._latency = config.latency
         self._fixed_ahead_s = config.latency.frames / fps
-        self._framings: dict[tuple[int, int], Framing] = {}
-        self.expect(riders_whole=False)
-
-    def expect(self, *, riders_whole: bool) -> None:
-        """Gets ready for another detector: whether it boxes rider and cycle as one. Resets."""
-        self._tracker_settings = tracker_settings(
-            self._config.tracking,
-            self._fps,
-            acceleration=self._config.latency.order == 2,
-            riders_whole=riders_whole,
-        )
         self.reset()
 
     def reset(self) -> None:
@@ -77,23 +66,6 @@ class Judge:
         self.tracker = Tracker(self._tracker_settings, self._speed_window_s, self._history)
         self._decider = Decider(self._rule)
         self._last_s = -math.inf
-
-    def framing_of(self, width: int, height: int) -> Framing:
-        """The framing of frames of this size; GeometryError when they are another camera's."""
-        known = self._framings.get((width, height))
-        if known is None:
-            known = self.sensor_framing.for_frame(width, height)
-            self._framings = {(width, height): known}
-        return known
-
-    def ground(self, detections: Detections, frame: Framing) -> tuple[GroundPoints, int]:
-        """Detections on the ground and in range, and how many do not lie on the ground at all."""
-        crop = frame.frame_to_crop(detections.bottom_centre_px())
-        xy, valid = self.table.lookup(crop)
-        near = valid & (np.nan_to_num(np.hypot(xy[:, 0], xy[:, 1]), nan=np.inf) < self._max_range_m)
-        index = np.nonzero(near)[0]
-        points = GroundPoints(detections.kind[index], xy[index], index.astype(np.int64))
-        return points, int((~valid).sum())
 
     def judge(
         self, detections: Detections, width: int, height: int, captured_s: float, age_s: float
@@ -104,7 +76,8 @@ class Judge:
         times must increase: a frame that is not newer than the last one is a ValueError.
         """
         began = time.perf_counter()
-        points, not_on_ground = self.ground(detections, self.framing_of(width, height))
+        view = self.viewpoint
+        points, not_on_ground = view.ground(detections, view.framing_of(width, height))
         return self.judge_points(points, captured_s, age_s, not_on_ground, began)
 
     def judge_points(

@@ -282,7 +282,7 @@ class Loop:
     def _misfit(self, frame: Frame) -> GeometryError | None:
         """Why a frame of this size has no place on the ground, or None."""
         try:
-            self._judge.framing_of(frame.width, frame.height)
+            self._judge.viewpoint.framing_of(frame.width, frame.height)
         except GeometryError as error:
             return error
         return None

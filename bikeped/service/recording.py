@@ -87,7 +87,7 @@ class OverlayVideo:
 
     def __init__(self, sink: VideoSink, judge: Judge) -> None:
         self._sink, self._judge = sink, judge
-        self._fov_deg = math.degrees(2 * judge.camera.lens.max_theta_rad)
+        self._fov_deg = math.degrees(2 * judge.viewpoint.camera.lens.max_theta_rad)
         self._drawing: asyncio.Task[None] | None = None
 
     async def frame(self, outcome: Outcome) -> None:
@@ -102,8 +102,8 @@ class OverlayVideo:
             latency_s=outcome.latency_ms["total"] / 1e3,
             history={k: np.asarray(v) for k, v in self._judge.tracker.history().items()},
         )
-        framing = self._judge.framing_of(frame.width, frame.height)
-        projector = ground_projector(self._judge.camera, framing)
+        framing = self._judge.viewpoint.framing_of(frame.width, frame.height)
+        projector = ground_projector(self._judge.viewpoint.camera, framing)
 
         def draw() -> None:
             self._sink.write(
@@ -114,7 +114,7 @@ class OverlayVideo:
                     frame_width=frame.width,
                     ground_to_frame=projector,
                     fov_deg=self._fov_deg,
-                    heading_deg=self._judge.camera.heading_deg,
+                    heading_deg=self._judge.viewpoint.camera.heading_deg,
                 )
             )
 

@@ -25,6 +25,7 @@ from bikeped.service.pages import Inside, Pages, open_pages
 from bikeped.service.parts import header_of, load_eye, start_publisher
 from bikeped.service.recording import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
 from bikeped.service.telemetry import Telemetry
+from bikeped.service.viewpoint import Viewpoint
 from bikeped.service.vision import Eye, ModelEye, Vision
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.messages import HealthMessage, Part
@@ -108,14 +109,14 @@ def replay(
     with contextlib.closing(source):
         if source.live:
             raise BikepedError(f"{source.name}: is a camera, not a recording; use bikeped run")
-        judge = Judge(loaded)
+        viewpoint = Viewpoint(loaded)
         try:
-            judge.framing_of(source.width, source.height)
+            viewpoint.framing_of(source.width, source.height)
         except GeometryError as error:
             raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
         warnings = [] if eye is not None else _size_warnings(loaded, source)
         looking = eye if eye is not None else load_eye(loaded, recorded=not realtime)
-        judge.expect(riders_whole=looking.riders_whole)
+        judge = Judge(loaded, riders_whole=looking.riders_whole, viewpoint=viewpoint)
         return asyncio.run(
             _replay(
                 loaded,

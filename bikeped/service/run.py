@@ -26,6 +26,7 @@ from bikeped.service.pages import Inside, Pages, open_pages
 from bikeped.service.parts import header_of, load_eye, start_publisher
 from bikeped.service.systemd import Notifier
 from bikeped.service.telemetry import Telemetry
+from bikeped.service.viewpoint import Viewpoint
 from bikeped.service.vision import Eye, Vision
 from bikeped.service.workers import Worker
 from bikeped.telemetry.audit import AuditLog
@@ -67,7 +68,7 @@ async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> in
     )
     provenance = check_provenance(loaded)
     log.log(logging.INFO if provenance.holds else logging.WARNING, "%s", provenance.text)
-    judge = Judge(loaded)
+    viewpoint = Viewpoint(loaded)
     light = light_driver(loaded.config.feedback)
     notifier = Notifier()
     async with contextlib.AsyncExitStack() as last:
@@ -80,7 +81,7 @@ async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> in
         if eye is None:
             return 0
         log.info("detector: %s, sha256 %s", eye.name, eye.model_hash or "none")
-        judge.expect(riders_whole=eye.riders_whole)
+        judge = Judge(loaded, riders_whole=eye.riders_whole, viewpoint=viewpoint)
         if loaded.config.detection.model == BUNDLED:
             log.warning("detection.model: %s", NOT_FOR_STREETS)
         async with contextlib.AsyncExitStack() as stack:

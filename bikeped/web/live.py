@@ -122,7 +122,7 @@ class Live:
 
     def _hello(self) -> dict[str, Any]:
         """What does not change while the service runs."""
-        loaded, lens = self._inside.loaded, self._inside.judge.camera.lens
+        loaded, lens = self._inside.loaded, self._inside.judge.viewpoint.camera.lens
         config = loaded.config
         return {
             "stages": STAGES,
@@ -136,7 +136,7 @@ class Live:
             if self._inside.mqtt is None
             else f"{config.mqtt.host}:{config.mqtt.port}",
             "fov_rad": 2 * lens.max_theta_rad,
-            "heading_deg": self._inside.judge.camera.heading_deg,
+            "heading_deg": self._inside.judge.viewpoint.camera.heading_deg,
             "range_m": config.tracking.max_range_m,
         }
 

@@ -126,13 +126,13 @@ class Painter:
             history=history,
         )
         small = self._picture(decoder, outcome)
-        framing = self._judge.sensor_framing.for_frame(frame.width, frame.height)
+        framing = self._judge.viewpoint.sensor_framing.for_frame(frame.width, frame.height)
         return encode_jpeg(
             draw_overlay(
                 small,
                 moment,
                 scale=small.shape[1] / frame.width,
-                ground_to_frame=ground_projector(self._judge.camera, framing),
+                ground_to_frame=ground_projector(self._judge.viewpoint.camera, framing),
                 banner=False,
             ),
             _QUALITY,

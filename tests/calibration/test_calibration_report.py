@@ -28,7 +28,7 @@ from bikeped.config import ground_camera, load_config
 from bikeped.conformance.suite import Suite
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens
-from bikeped.service.judge import Judge
+from bikeped.service.viewpoint import Viewpoint
 
 FRAMING = Framing(3840, 2160, 3840, 3500)
 K = (0.01, -0.012, 0.004, -0.0007)
@@ -85,8 +85,8 @@ def test_run_replay_and_conformance_read_all_four_terms(done: Calibrated, tmp_pa
     cut = load_config(config, ["camera.k3=0", "camera.k4=0"])
     pixel = np.array([[2900.0, 2900.0]])
     suites = [Suite.load([], loaded), Suite.load([], cut)]
-    judges = [Judge(loaded), Judge(cut)]  # the loop's own, for run and replay
-    for all_four, two in (suites, judges):
+    judged = [Viewpoint(loaded), Viewpoint(cut)]  # the loop's own, for run and replay
+    for all_four, two in (suites, judged):
         assert all_four.camera.lens.k == done.fits["equidistant+k4"].state.terms
         here, _ = all_four.camera.ground(pixel)
         there, _ = two.camera.ground(pixel)

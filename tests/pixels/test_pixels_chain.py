@@ -80,8 +80,7 @@ def test_the_loop_and_the_ladder_decide_alike(
     from bikeped.pixels.ladder import _judge_boxes
     from bikeped.service.judge import Judge
 
-    judge = Judge(loaded)
-    judge.expect(riders_whole=run.riders_whole)
+    judge = Judge(loaded, riders_whole=run.riders_whole)
     again = _judge_boxes(judge, run, lambda r, f: r.detections[f])
     np.testing.assert_array_equal(again, run.state)
 

@@ -26,17 +26,16 @@ def kinds_of_a_walker_first_taken_for_a_cyclist(judge: Judge) -> set[int]:
 
 @pytest.mark.parametrize(("riders_whole", "expected"), [(False, C), (True, P)])
 def test_only_where_bicycles_are_easily_missed_a_person_stays_on_one(riders_whole, expected):
-    judge = Judge(load_config(None))
+    judge = Judge(load_config(None), riders_whole=riders_whole)
     for _ in range(2):  # nothing of the first round is left in the second
-        judge.expect(riders_whole=riders_whole)
+        judge.reset()
         assert kinds_of_a_walker_first_taken_for_a_cyclist(judge) == {expected}
 
 
 @pytest.mark.parametrize("wrong", [P, C])
 def test_one_wrong_first_sight_starts_no_memory_of_a_cyclist(wrong):
     """Two sights make a track; when they differ, the newer one is right."""
-    judge = Judge(load_config(None))
-    judge.expect(riders_whole=True)
+    judge = Judge(load_config(None), riders_whole=True)
     right = P if wrong is C else C
     box = np.array([[1880.0, 1500.0, 1960.0, 1800.0]], np.float32)
     for frame in range(20):
@@ -49,9 +48,9 @@ def test_one_wrong_first_sight_starts_no_memory_of_a_cyclist(wrong):
         )
 
 
-def test_another_detector_forgets_what_the_first_one_saw():
+def test_a_reset_forgets_what_was_seen():
     judge = Judge(load_config(None))
     kinds_of_a_walker_first_taken_for_a_cyclist(judge)
-    judge.expect(riders_whole=True)
+    judge.reset()
     tracks = judge.judge(Detections.empty(), 3840, 2160, 0.0, 0.0).tracks
     assert len(tracks) == 0

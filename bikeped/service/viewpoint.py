@@ -1,0 +1,45 @@
+"""Where the camera hangs, and what of the ground it sees: geometry alone, as it is configured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bikeped.config import LoadedConfig, framing, ground_camera
+from bikeped.geometry import Framing, GroundTable
+from bikeped.types import Detections, GroundPoints
+
+
+class Viewpoint:
+    """The configured camera, its framing and its ground table.
+
+    Made from a configuration whose lens, framing and ground do not fit together, it raises
+    `GeometryError`: what starts the service makes it before anything that takes long.
+    """
+
+    def __init__(self, loaded: LoadedConfig) -> None:
+        self.sensor_framing = framing(loaded)
+        self.camera = ground_camera(loaded)
+        self.table = GroundTable(
+            self.camera,
+            *self.sensor_framing.crop_wh,
+            step_px=loaded.config.camera.table_step_px,
+        )
+        self._max_range_m = loaded.config.tracking.max_range_m
+        self._framings: dict[tuple[int, int], Framing] = {}
+
+    def framing_of(self, width: int, height: int) -> Framing:
+        """The framing of frames of this size; GeometryError when they are another camera's."""
+        known = self._framings.get((width, height))
+        if known is None:
+            known = self.sensor_framing.for_frame(width, height)
+            self._framings = {(width, height): known}
+        return known
+
+    def ground(self, detections: Detections, frame: Framing) -> tuple[GroundPoints, int]:
+        """Detections on the ground and in range, and how many do not lie on the ground at all."""
+        crop = frame.frame_to_crop(detections.bottom_centre_px())
+        xy, valid = self.table.lookup(crop)
+        near = valid & (np.nan_to_num(np.hypot(xy[:, 0], xy[:, 1]), nan=np.inf) < self._max_range_m)
+        index = np.nonzero(near)[0]
+        points = GroundPoints(detections.kind[index], xy[index], index.astype(np.int64))
+        return points, int((~valid).sum())
