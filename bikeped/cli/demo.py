@@ -15,7 +15,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.cli.web_options import open_pages, web_option, web_overrides
+from bikeped.cli.web_options import open_pages, say_where, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.files import make_folder, write_whole
 
@@ -82,11 +82,13 @@ def command(
         result = replay(
             loaded,
             str(clip),
+            own_camera=True,
             files=ReplayFiles(events, overlay),
             realtime=pages is not None,
             mqtt=False,
             progress=tell,
             pages=pages,
+            serving=say_where,
         )
     lines = [json.loads(line) for line in events.read_text(encoding="utf-8").splitlines()]
     summary = {

@@ -17,7 +17,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded
-from bikeped.cli.web_options import open_pages, web_option, web_overrides
+from bikeped.cli.web_options import open_pages, say_where, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.files import make_folder
 
@@ -74,6 +74,7 @@ def command(
             mqtt=not no_mqtt,
             progress=progress,
             pages=pages,
+            serving=say_where,
         )
     summary = result.as_dict()
     if out is not None:

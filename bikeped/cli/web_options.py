@@ -38,6 +38,11 @@ def web_overrides(place: str) -> tuple[str, ...]:
     return ("web.enabled=true", f"web.host={host!r}", f"web.port={int(found['port'])}")
 
 
+def say_where(address: str) -> None:
+    """Tells on standard error where the page is."""
+    click.echo(f"{address} shows it while it runs", err=True)
+
+
 def open_pages(loaded: LoadedConfig) -> ServicePages:
     """The pages of a service or a replay; ConfigError when others could see them unasked."""
     from bikeped.web.service import ServicePages

@@ -91,16 +91,19 @@ def replay(
     recording: str,
     *,
     eye: Eye | None = None,
+    own_camera: bool = False,
     files: ReplayFiles = ReplayFiles(),
     realtime: bool = False,
     mqtt: bool = True,
     progress: Callable[[int], None] | None = None,
     pages: Pages | None = None,
+    serving: Callable[[str], None] | None = None,
 ) -> ReplayResult:
     """Runs a recording through the loop; raises BikepedError with one line that says the mend.
 
-    `eye` in place of the configured model belongs to the recording, so its size is no surprise.
-    `pages` are served while it runs.
+    `eye` in place of the configured model belongs to the recording, so its size is no surprise; nor
+    is it where the configured camera is known to have made it (`own_camera`).
+    `pages` are served while it runs; `serving` gets their address.
     """
     camera = loaded.config.camera
     source = open_source(
@@ -114,7 +117,7 @@ def replay(
             viewpoint.framing_of(source.width, source.height)
         except GeometryError as error:
             raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
-        warnings = [] if eye is not None else _size_warnings(loaded, source)
+        warnings = [] if own_camera or eye is not None else _size_warnings(loaded, source)
         looking = eye if eye is not None else load_eye(loaded, recorded=not realtime)
         judge = Judge(loaded, riders_whole=looking.riders_whole, viewpoint=viewpoint)
         return asyncio.run(
@@ -128,6 +131,7 @@ def replay(
                 [] if progress is None else [Progress(progress)],
                 warnings,
                 pages,
+                serving,
             )
         )
 
@@ -142,6 +146,7 @@ async def _replay(
     outputs: list[Output],
     warnings: list[str],
     pages: Pages | None,
+    serving: Callable[[str], None] | None,
 ) -> ReplayResult:
     config = loaded.config
     tally = Tally()
@@ -197,6 +202,8 @@ async def _replay(
             server = await open_pages(pages, inside, config.web, stack)
             if server.error is not None:
                 raise BikepedError(server.error)
+            if serving is not None:
+                serving(str(server.address))
         telling = asyncio.create_task(
             tell_health(telemetry, loop, health, config.mqtt.health_interval_s)
         )

@@ -114,8 +114,16 @@ class HttpServer:
         self._runner = runner
         self.error = None
         self.port = int(self._server.sockets[0].getsockname()[1])
-        log.info("web: serving http://%s:%d", config.host, self.port)
+        log.info("web: serving %s", self.address)
         return True
+
+    @property
+    def address(self) -> str | None:
+        """What to open in a browser; None while it does not serve."""
+        if self.port is None:
+            return None
+        host = f"[{self._config.host}]" if ":" in self._config.host else self._config.host
+        return f"http://{host}:{self.port}/"
 
     async def stop(self) -> None:
         """Stops serving; open requests get a second to end. Who takes nothing is cut off."""

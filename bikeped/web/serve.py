@@ -40,8 +40,7 @@ async def _serve(config: WebConfig, app: web.Application, announce: Callable[[st
     if not await server.start():
         raise BikepedError(str(server.error))
     try:
-        host = f"[{config.host}]" if ":" in config.host else config.host
-        announce(f"http://{host}:{server.port}/")
+        announce(str(server.address))
         await stop.wait()
     finally:
         await server.stop()

@@ -84,7 +84,7 @@ def test_a_folder_of_pictures_is_a_recording(small_jpegs, small_config, tmp_path
     assert f"{len(small_jpegs)} frames" in capsys.readouterr().out
 
 
-def test_the_demo_end_to_end_in_short(tmp_path, capsys):
+def test_the_demo_end_to_end_in_short(tmp_path, capsys, caplog):
     out = tmp_path / "demo"
     assert main(["demo", "--seconds", "0.5", "--out", str(out), "--json", "-"]) == 0
     summary = json.loads(capsys.readouterr().out)
@@ -104,6 +104,7 @@ def test_the_demo_end_to_end_in_short(tmp_path, capsys):
     }
     assert json.loads((out / "summary.json").read_text()) == summary
     assert "must not" in (out / "summary.txt").read_text()
+    assert caplog.records == [], "the drawn clip is the configured camera's: nothing to warn of"
 
 
 def test_config_check_and_show(small_config, capsys):

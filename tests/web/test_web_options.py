@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from bikeped.cli.main import main
@@ -50,11 +52,10 @@ def test_a_replay_for_everybody_is_refused_before_it_starts(
     assert said in line
 
 
-def test_a_replay_with_pages_says_where(small_config, make_clip, capsys, caplog):
-    caplog.set_level("INFO")
+def test_a_replay_with_pages_says_where(small_config, make_clip, capsys):
     clip = make_clip("c.avi", 3)
     assert main(["replay", str(clip), "-c", str(small_config()), "--web", "0"]) == 0
-    assert "web: serving http://127.0.0.1:" in caplog.text
+    assert re.search(r"^http://127\.0\.0\.1:\d+/ shows it", capsys.readouterr().err, re.MULTILINE)
 
 
 def test_an_address_that_cannot_be_bound_ends_a_replay_with_the_mend(
