@@ -10,7 +10,7 @@ import msgspec
 from bikeped import __version__
 from bikeped.config import DetectionConfig, LoadedConfig, road_region
 from bikeped.cores import cores
-from bikeped.detection.base import load_detector
+from bikeped.detection.load import load_detector
 from bikeped.errors import DetectorError
 from bikeped.service.vision import MOST_LOOKS, Eye, ModelEye
 from bikeped.telemetry.messages import EventHeader, event_header

@@ -22,8 +22,8 @@ import numpy as np
 from bikeped.errors import DataSetError, DetectorError
 from bikeped.files import make_folder, write_whole
 from bikeped.training.coco import CocoData, CocoImage, write_annotations
-from bikeped.training.export import with_metadata
 from bikeped.training.needs import need
+from bikeped.training.onnx_file import compare, with_metadata
 
 _VALIDATION_SHARE = 20  #: one picture in so many, where no validation set is named
 _OPSET = 17
@@ -102,8 +102,6 @@ def export_yolo(weights: Path, out: Path, size: int) -> dict[str, Any]:
     The library itself compares nothing: the answer is held against PyTorch's here. Raises
     DetectorError.
     """
-    from bikeped.training.export import compare
-
     model = _load(weights, None, "cpu")
     names = [str(model.names[i]) for i in range(len(model.names))]
     with tempfile.TemporaryDirectory() as folder:

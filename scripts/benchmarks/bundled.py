@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import cv2
 
 if TYPE_CHECKING:
-    from bench import Figures
+    from benchmarks.figures import Figures
 
 FRAMES, DISTINCT = 240, 24
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from bench import Figures
-
+    from benchmarks.figures import Figures
     from bikeped.calibration.model import Model, Sightings, State
     from bikeped.calibration.views import BoardView
 

@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from bench import Figures
-
+    from benchmarks.figures import Figures
     from bikeped.config import LoadedConfig
     from bikeped.conformance.suite import Suite
 
 
 def run(figures: Figures) -> None:
     """Seven configurations over the bundled scenarios, with and without localisation error."""
-    from bench import in_turns
-
+    from benchmarks.figures import in_turns
     from bikeped.config import load_config, rule_settings
     from bikeped.conformance.scenario import bundled_folder, load_scenarios
     from bikeped.conformance.simulate import SIMULATION_TRACKER

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 
 if TYPE_CHECKING:
-    from bench import Figures
+    from benchmarks.figures import Figures
 
 
 def frame(figures: Figures) -> None:
     """A drawn 3840 x 2160 street as JPEG, onto inputs of 1280 and 416 pixels."""
-    from bench import in_turns
-
+    from benchmarks.figures import in_turns
     from benchmarks.pictures import street_4k
     from bikeped.capture import JpegDecoder
     from bikeped.detection.preprocess import Preprocessor
@@ -53,8 +52,7 @@ def frame(figures: Figures) -> None:
 
 def nms(figures: Figures) -> None:
     """300 and 3000 boxes in clumps, as a detector gives them before suppression."""
-    from bench import in_turns
-
+    from benchmarks.figures import in_turns
     from bikeped.detection.nms import suppress
 
     rng = np.random.default_rng(1)

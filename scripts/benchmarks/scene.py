@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import cv2
-from bench import Figures, in_turns
 
+from benchmarks.figures import Figures, in_turns
 from bikeped.config import load_config
 from bikeped.conformance.scenario import bundled_folder, load_scenario
 from bikeped.scene import Conditions, SceneCamera, ScenePainter, random_scenario, scene_camera

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from bench import Figures
+    from benchmarks.figures import Figures
 
 
 def _measured(build: Callable[[], float]) -> tuple[float, float, float]:

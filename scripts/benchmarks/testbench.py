@@ -9,7 +9,7 @@ import threading
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from bench import Figures
+    from benchmarks.figures import Figures
 
 MOVES = 15
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
@@ -33,8 +33,7 @@ def run(figures: Figures) -> None:
     except ImportError:
         print("testbench: skipped, playwright is not installed (pip install bikeped[test])")
         return
-    from bench import in_turns
-
+    from benchmarks.figures import in_turns
     from bikeped.config import DecisionConfig, load_config
     from bikeped.conformance.scenario import bundled_folder, load_scenarios
     from bikeped.conformance.suite import Suite

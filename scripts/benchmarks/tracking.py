@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from bench import Figures
+    from benchmarks.figures import Figures
 
 FRAMES = 60
 GOALS_MS = {10: 0.3, 50: 0.8, 200: 4.0}
@@ -16,8 +16,7 @@ GOALS_MS = {10: 0.3, 50: 0.8, 200: 4.0}
 
 def run(figures: Figures) -> None:
     """Walkers and cyclists in equal number on 40 x 40 m, with 3 cm of noise."""
-    from bench import in_turns
-
+    from benchmarks.figures import in_turns
     from bikeped.config import load_config, rule_settings, tracker_settings
     from bikeped.decision import Decider
     from bikeped.tracking import Tracker

@@ -185,9 +185,9 @@ def test_an_exported_file_is_what_the_detector_loads(fitted, tmp_path):
 
 
 def test_nothing_is_written_where_runtime_and_pytorch_disagree(fitted, tmp_path, monkeypatch):
-    from bikeped.training import export
+    from bikeped.training import onnx_file
 
-    monkeypatch.setattr(export, "_MOST_SCORE", -1.0)
+    monkeypatch.setattr(onnx_file, "_MOST_SCORE", -1.0)
     model = tmp_path / "model.onnx"
     with pytest.raises(DetectorError, match=r"model\.onnx: ONNX Runtime's answer differs"):
         export_network(fitted.network, fitted.names, fitted.size, model, {})
