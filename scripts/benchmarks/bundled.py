@@ -38,10 +38,10 @@ def run(figures: Figures) -> None:
                 writer.write(pictures[i % DISTINCT])
         ours, obvious, int8_ms, float_ms = [], [], [], []
         for _ in range(3):
-            result = replay(loaded, str(clip), mqtt=False)
+            result = replay(loaded, str(clip), own_camera=True, mqtt=False)
             ours.append(result.frames / result.wall_s)
             int8_ms.append(result.times.percentiles()["inference"]["p50"])
-            result = replay(in_float, str(clip), mqtt=False)
+            result = replay(in_float, str(clip), own_camera=True, mqtt=False)
             float_ms.append(result.times.percentiles()["inference"]["p50"])
             obvious.append(_one_after_another(clip, BUNDLED_FILE))
     figures.add(

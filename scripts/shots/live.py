@@ -6,8 +6,6 @@ a detector.
 
 from __future__ import annotations
 
-import logging
-import re
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,24 +71,19 @@ class _Showing:
         self.eye = _Eye(clip)
         self.url = ""
         self._known = threading.Event()
-        handler = logging.Handler()
-        handler.emit = self._heard  # type: ignore[method-assign]
-        http = logging.getLogger("bikeped.telemetry.http")
-        http.addHandler(handler)
-        http.setLevel(logging.INFO)
         pages = ServicePages(loaded)
         self._thread = threading.Thread(
-            target=lambda: replay(loaded, str(clip), eye=self.eye, mqtt=False, pages=pages),
+            target=lambda: replay(
+                loaded, str(clip), eye=self.eye, mqtt=False, pages=pages, serving=self._heard
+            ),
             daemon=True,
         )
         self._thread.start()
         assert self._known.wait(120)
-        http.removeHandler(handler)
 
-    def _heard(self, record: logging.LogRecord) -> None:
-        if found := re.search(r"http://\S+", record.getMessage()):
-            self.url = found[0]
-            self._known.set()
+    def _heard(self, address: str) -> None:
+        self.url = address
+        self._known.set()
 
     def end(self) -> None:
         self.eye.done.set()
