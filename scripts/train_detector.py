@@ -231,6 +231,7 @@ def experiment(out: Path) -> None:
         source = read_coco(folder / "ordinary")
         augment_data(source, folder / "augmented", order, counted("augmented", len(source.images)))
     lines: dict[str, Any] = {
+        "commit": commit(),
         "pictures": EXPERIMENT_PICTURES,
         "steps": EXPERIMENT_STEPS,
         "weights": sum(p.numel() for p in SmallNet(len(Kind)).parameters()),

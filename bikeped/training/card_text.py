@@ -238,7 +238,7 @@ def _experiment(experiment: Mapping[str, Any]) -> str:
     said += f"{experiment['steps']} steps each on "
     said += f"{experiment['pictures']} rectilinear drawings, and on those drawings warped by "
     said += "`bikeped model augment`; both measured on held-out drawn fisheye pictures "
-    said += "(`scripts/train-detector --experiment`)."
+    said += f"(`scripts/train-detector --experiment`, commit {experiment['commit']})."
     lines = [
         "## Trained on ordinary pictures, and on the same pictures made fisheye",
         "",
