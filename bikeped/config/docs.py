@@ -15,8 +15,8 @@ from bikeped.files import write_whole
 _INTRO = """\
 # Configuration
 
-<!-- Made by `python -m bikeped.config.docs docs/configuration.md` from bikeped/config/sections.py;
-     and the two beside it; change the descriptions there. -->
+<!-- Made by `python -m bikeped.config.docs docs/configuration.md` from the sections in
+     bikeped/config; change the descriptions there. -->
 
 Every key of `config.yaml`, in the order of the file. A key that is left out has its default; a
 key that is not listed here stops the start with its name and the nearest known one. A key may

@@ -17,11 +17,11 @@ class Viewpoint:
     """
 
     def __init__(self, loaded: LoadedConfig) -> None:
-        self.sensor_framing = framing(loaded)
+        self._sensor_framing = framing(loaded)
         self.camera = ground_camera(loaded)
         self.table = GroundTable(
             self.camera,
-            *self.sensor_framing.crop_wh,
+            *self._sensor_framing.crop_wh,
             step_px=loaded.config.camera.table_step_px,
         )
         self._max_range_m = loaded.config.tracking.max_range_m
@@ -31,7 +31,7 @@ class Viewpoint:
         """The framing of frames of this size; GeometryError when they are another camera's."""
         known = self._framings.get((width, height))
         if known is None:
-            known = self.sensor_framing.for_frame(width, height)
+            known = self._sensor_framing.for_frame(width, height)
             self._framings = {(width, height): known}
         return known
 

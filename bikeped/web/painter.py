@@ -126,7 +126,7 @@ class Painter:
             history=history,
         )
         small = self._picture(decoder, outcome)
-        framing = self._judge.viewpoint.sensor_framing.for_frame(frame.width, frame.height)
+        framing = self._judge.viewpoint.framing_of(frame.width, frame.height)
         return encode_jpeg(
             draw_overlay(
                 small,
