@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
-from bikeped.errors import DetectorError
 from bikeped.training.coco import CocoData
 from bikeped.training.crops import CropSettings
+from bikeped.training.device import knows_bfloat16, named_device
 from bikeped.training.export import export_network
 from bikeped.training.fit import FitSettings, fit, save_weights, settings_as_dict
 
@@ -39,7 +39,7 @@ def train_small(
 
     Raises DataSetError and DetectorError.
     """
-    device = _device(order.device)
+    device = named_device(order.device)
     on_cpu = device == "cpu"
     settings = FitSettings(
         steps=order.steps,
@@ -47,6 +47,7 @@ def train_small(
         warmup=min(100, max(1, order.steps // 10)),
         workers=2 if on_cpu and order.pictures % 2 == 0 else 1,
         seed=order.seed,
+        bfloat16=knows_bfloat16(device),  # said, so that training.json tells what was done
         device=device,
         crops=order.crops,
     )
@@ -72,17 +73,3 @@ def train_small(
         "settings": settings_as_dict(settings),
         "losses": fitted.losses,
     }
-
-
-def _device(asked: str) -> str:
-    if asked == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    device = f"cuda:{asked}" if asked.isdigit() else asked
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise DetectorError(
-            f"--device {asked}: cannot be used ({reason}); use cpu or auto"
-        ) from error
-    return device

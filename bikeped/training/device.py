@@ -1,0 +1,35 @@
+"""What the small network is trained on: which processor or GPU, and what it multiplies itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from bikeped.errors import DetectorError
+
+
+def named_device(asked: str) -> str:
+    """PyTorch's name of the device `asked`: `auto`, `cpu`, or a GPU's number; DetectorError."""
+    if asked == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    device = f"cuda:{asked}" if asked.isdigit() else asked
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise DetectorError(
+            f"--device {asked}: cannot be used ({reason}); use cpu or auto"
+        ) from error
+    return device
+
+
+def knows_bfloat16(device: str) -> bool:
+    """Whether it multiplies bfloat16 itself (of processors: AVX-512 BF16, AMX, or Arm's BF16)."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    try:
+        flags = set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+    except OSError:
+        return False
+    return bool(flags & {"avx512_bf16", "amx_bf16", "bf16"})
