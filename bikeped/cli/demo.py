@@ -17,6 +17,7 @@ from bikeped.cli.common import (
 from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.cli.web_options import open_pages, say_where, web_option, web_overrides
 from bikeped.config import load_config
+from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
 
 SIZE = (1920, 1080)
@@ -58,6 +59,7 @@ def command(
     from bikeped.scene import Conditions, ScenePainter, scene_camera, sidecar_path
     from bikeped.scene.clip import frame_times, write_clip
     from bikeped.service.replay import ReplayFiles, replay
+    from bikeped.telemetry.http import port_error
 
     if web_place is not None:
         overrides += web_overrides(web_place)
@@ -67,6 +69,8 @@ def command(
     pages = None if web_place is None else open_pages(loaded)
     clip, events, overlay = out / "crossing.avi", out / "events.jsonl", out / "overlay.mp4"
     names = [clip, sidecar_path(clip), events, overlay, out / "summary.txt", out / "summary.json"]
+    if pages is not None and (refused := port_error(loaded.config.web)) is not None:
+        raise BikepedError(refused)  # before a minute of drawing, not after
     make_folder(out)
     check_outputs(
         [("-c", config_path)] if config_path is not None else [],

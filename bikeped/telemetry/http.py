@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable, Mapping
 from typing import Any, get_args
 
@@ -105,10 +106,7 @@ class HttpServer:
             )
         except OSError as exc:
             await runner.cleanup()
-            self.error = (
-                f"cannot serve http://{config.host}:{config.port} "
-                f"({exc.strerror or exc}): set web.host and web.port to a free one of this machine"
-            )
+            self.error = _refusal(config, exc)
             log.error("web: %s", self.error)
             return False
         self._runner = runner
@@ -152,6 +150,27 @@ def _is_news(record: logging.LogRecord) -> bool:
 
 
 _requests_log.addFilter(_is_news)
+
+
+def port_error(config: WebConfig) -> str | None:
+    """Why `HttpServer` could not serve at `config` now, one line with the mend; None if it could.
+
+    For what only serves after long work: somebody else may have taken the port by then.
+    """
+    try:
+        found = socket.getaddrinfo(config.host, config.port, type=socket.SOCK_STREAM)
+        for family, _, _, _, place in found:
+            socket.create_server(place, family=family).close()
+    except OSError as exc:
+        return _refusal(config, exc)
+    return None
+
+
+def _refusal(config: WebConfig, error: OSError) -> str:
+    return (
+        f"cannot serve http://{config.host}:{config.port} "
+        f"({error.strerror or error}): set web.host and web.port to a free one of this machine"
+    )
 
 
 class _TurnAway(asyncio.Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 
 import cv2
@@ -82,6 +83,17 @@ def test_a_folder_of_pictures_is_a_recording(small_jpegs, small_config, tmp_path
         (folder / f"{n}.jpg").write_bytes(jpeg)
     assert main(["replay", str(folder), "-c", str(small_config())]) == 0
     assert f"{len(small_jpegs)} frames" in capsys.readouterr().out
+
+
+def test_a_demo_whose_page_finds_its_port_taken_says_so_before_it_draws(tmp_path, capsys):
+    out = tmp_path / "demo"
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["demo", "--web", str(port), "--out", str(out)]) == 2
+    assert f":{port}" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_the_demo_end_to_end_in_short(tmp_path, capsys, caplog):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import socket
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -15,7 +16,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
 from bikeped.config import WebConfig, is_loopback
-from bikeped.telemetry.http import Health, HttpServer, add_monitoring, host_name
+from bikeped.telemetry.http import Health, HttpServer, add_monitoring, host_name, port_error
 from bikeped.telemetry.metrics import Metrics
 
 
@@ -167,6 +168,18 @@ async def test_a_taken_port_is_an_error_text_and_nothing_more():
     assert str(port) in (server.error or "")
     assert "web.port" in (server.error or "")
     await server.stop()
+
+
+def test_whether_a_port_is_free_can_be_asked_before():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        refused = port_error(WebConfig(port=port))
+    assert re.search(f"{port} .*set web.host and web.port", refused or "")
+    assert port_error(WebConfig(port=port)) is None
+    assert port_error(WebConfig(port=port, host="localhost")) is None
+    assert "web.host" in (port_error(WebConfig(port=port, host="192.0.2.1")) or "")
 
 
 @pytest.mark.parametrize(
