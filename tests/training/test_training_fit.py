@@ -111,6 +111,22 @@ def test_the_first_steps_see_squares_and_the_last_ones_windows(data, monkeypatch
     assert seen == [{(128, 128)}] * 2 + [{(64, 96)}] * 2
 
 
+def test_only_the_squares_are_looked_at_in_sixteen_bits(data, monkeypatch):
+    from bikeped.training import fit as module
+
+    seen = []
+
+    def loss(score, *others):
+        seen.append(score.dtype)
+        return real(score, *others)
+
+    real = module.detection_loss
+    monkeypatch.setattr(module, "detection_loss", loss)
+    fitted = fit(data, replace(SETTINGS, workers=1, steps=4, packed=0.5, bfloat16=True))
+    assert seen == [torch.bfloat16] * 2 + [torch.float32] * 2
+    assert {p.dtype for p in fitted.network.parameters()} == {torch.float32}
+
+
 def test_without_a_rate_for_matrices_adam_moves_all_weights(data, fitted):
     other = fit(data, replace(SETTINGS, matrix_rate=0.0))
     first, second = (f.network.stem[0].conv.weight for f in (fitted, other))
