@@ -27,7 +27,7 @@ def named_device(asked: str) -> str:
 def knows_bfloat16(device: str) -> bool:
     """Whether it multiplies bfloat16 itself (of processors: AVX-512 BF16, AMX, or Arm's BF16)."""
     if torch.device(device).type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     try:
         flags = set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
     except OSError:
