@@ -68,8 +68,9 @@ VALIDATION = DrawnTest(pictures=1200, seed=8_000_001)
 TEST = DrawnTest(pictures=1200, seed=9_000_001)
 OTHER_LENSES = replace(TEST, pictures=300, seed=9_500_001, own_lens=True)
 #: The shipped confidence of a kind is the lowest with at most this many false ones a 100 frames on
-#: the validation pictures: pedestrians and cyclists share the one that is aimed at.
-MOST_FALSE = {Kind.PEDESTRIAN: 0.5, Kind.CYCLIST: 0.5, Kind.VEHICLE: 3.0}
+#: the validation pictures: of pedestrians and cyclists together the one that is aimed at, shared so
+#: that both are found as often as is aimed at there.
+MOST_FALSE = {Kind.PEDESTRIAN: 0.6, Kind.CYCLIST: 0.4, Kind.VEHICLE: 3.0}
 GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 
 #: Of the experiment: both networks get as much of everything. Steps of half the size, so that there

@@ -50,10 +50,10 @@ def shown_pictures(
 def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
     """Writes `model`, an ONNX file of the small network, in eight bits to `out`; returns its bytes.
 
-    `pictures` as `shown_pictures` has them: all that passes between layers for them is within the
-    steps. Weights take seven of the eight bits, for with eight the sums of two products overflow on
-    processors with AVX2 only (ONNX Runtime, "Quantize ONNX models", `reduce_range`). Raises
-    DetectorError where there is no picture, or the model is none of ours.
+    `pictures` as `shown_pictures` has them: the mean of what each of them needs is within the
+    steps, what is beyond is cut off. Weights take seven of the eight bits, for with eight the sums
+    of two products overflow on processors with AVX2 only (ONNX Runtime, "Quantize ONNX models",
+    `reduce_range`). Raises DetectorError where there is no picture, or the model is none of ours.
     """
     import onnx
     from onnxruntime.quantization import (
@@ -96,6 +96,9 @@ def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
                 reduce_range=True,
                 op_types_to_quantize=_OPERATIONS,
                 nodes_to_exclude=kept,
+                # The steps are as wide as a usual picture needs: one glaring picture would make
+                # them coarser for all others.
+                extra_options={"CalibMovingAverage": True},
             )
             content = file.read_bytes()
     except ValueError as error:
