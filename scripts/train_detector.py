@@ -75,7 +75,7 @@ GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 
 #: Of the experiment: both networks get as much of everything. Steps of half the size, so that there
 #: are enough of them to learn something.
-EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 1000, 4000
+EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 500, 2500
 
 
 def main() -> int:
