@@ -40,7 +40,7 @@ There is more of what is hard to tell than in the streets it is measured on: {mi
 | seeds | pictures {seed_data}, training {seed}; validation and tests from seeds of their own |
 | drawing | {drawing_min:.0f} min{drawing_note} |
 | training | {steps} steps, {training_min:.0f} min |
-| first {packed:.0%} | {squares} squares of {side} pixels{digits}; {things:.0%} of windows: things |
+| first {packed:.0%} | {squares} squares of {side} pixels{digits}; {things:.0%} around things |
 | then | {windows} windows of 480 x 288 pixels a step |
 | machine | {machine}; PyTorch {torch} on the CPU, two threads{beside} |
 
