@@ -120,6 +120,8 @@ def card_text(card: Mapping[str, Any]) -> str:
         ("Through other fisheye lenses, heights and pitches", "other_lenses"),
     ):
         text += "\n" + _measured(title, card[key])
+    if "again" in card:
+        text += "\n" + _again(card["again"])
     text += "\n" + _in_float(model["file"], card["configured_camera_float"])
     if "experiment" in card:
         text += "\n" + _experiment(card["experiment"])
@@ -204,16 +206,27 @@ def _measured(title: str, test: Mapping[str, Any]) -> str:
 
 
 def _in_float(file: str, test: Mapping[str, Any]) -> str:
+    return (
+        "### What rounding to eight bits costs\n\n"
+        f"`{file}` on the same pictures as above, through the configured camera: {_near(test)}.\n"
+    )
+
+
+def _again(test: Mapping[str, Any]) -> str:
+    return (
+        "### How exact that is\n\n"
+        f"The same through the configured camera on {test['frames']} other frames, from seed "
+        f"{test['seed']}: {_near(test)}.\n"
+    )
+
+
+def _near(test: Mapping[str, Any]) -> str:
     recalls = " and ".join(
         f"{test['kinds'][k.label]['within_15_m']['recall']:.1%} of the {k.label}s"
         for k in _WALKS_AND_RIDES
     )
     false = test["false_pedestrian_or_cyclist_per_100_frames"]
-    return (
-        "### What rounding to eight bits costs\n\n"
-        f"`{file}` on the same pictures as above, through the configured camera: within 15 m "
-        f"{recalls}, with {false:g} false pedestrians or cyclists a 100 frames.\n"
-    )
+    return f"within 15 m {recalls}, with {false:g} false pedestrians or cyclists a 100 frames"
 
 
 def _percent(value: float | None) -> str:
