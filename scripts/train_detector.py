@@ -47,21 +47,25 @@ from bikeped.training.coco import read_coco
 from bikeped.training.crops import CropSettings
 from bikeped.training.drawn import DrawnSettings, draw_set
 from bikeped.training.export import export_network
-from bikeped.training.fit import FitSettings, fit, load_weights
+from bikeped.training.fit import FitSettings, fit
+from bikeped.training.mining import MiningSettings
 from bikeped.training.network import SmallNet, multiply_adds, shift_scores
 from bikeped.training.packing import PackSettings
 from bikeped.training.quantise import PICTURES as STEPS_FROM
 from bikeped.training.quantise import quantise, shown_pictures
 from bikeped.training.small import SmallOrder, train_small
 from bikeped.training.warp import WarpRanges
+from bikeped.training.weights import load_weights
 from bikeped.types import Kind
 
 #: The steps take less than an hour on two cores that multiply bfloat16 themselves.
-PICTURES, STEPS = 5000, 12000
+PICTURES, STEPS = 5000, 11200
 #: Width and height of the whole frame as the shipped network is shown it: what two cores answer 30
 #: times a second. It learns on pictures 1280 across, made a little smaller and larger about this.
 SHOWN = (1152, 672)
 CROPS = CropSettings(scale=(0.8, 1.02))
+#: While it still learns fast, and again before it sees plain windows.
+MINING = MiningSettings(after=(0.4, 0.7))
 TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
 VALIDATION = DrawnTest(pictures=1200, seed=8_000_001)
 #: As many as that one street, of which come four, does not decide how many false ones there are.
@@ -119,7 +123,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
     training = out / "training"
     if not (training / "training.json").is_file():
         make_folder(training)
-        order = SmallOrder(steps=steps, device="cpu", crops=CROPS)
+        order = SmallOrder(steps=steps, device="cpu", crops=CROPS, mining=MINING)
         write_json(
             training / "training.json", train_small(read_coco(data), training, order, say=say)
         )

@@ -17,7 +17,7 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.preprocess import PAD, Letterbox
 from bikeped.errors import CaptureError, DataSetError
-from bikeped.training.coco import Box, CocoData, CocoImage, furniture, read_picture
+from bikeped.training.coco import MISTAKEN, Box, CocoData, CocoImage, furniture, read_picture
 from bikeped.types import FloatArray, ImageArray, IntArray
 
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
@@ -36,6 +36,8 @@ class CropSettings:
     window: tuple[int, int] = (480, 288)
     around_object: float = 0.65  #: share of windows that are cut around an object
     around_usual: float = 0.2  #: share cut where some other picture has an object
+    #: Share cut around a mistake, of the windows of pictures where a network made one.
+    around_mistaken: float = 0.5
     scale: tuple[float, float] = (0.72, 1.1)
     flip: float = 0.5
     cover: float = 0.15  #: share of windows with something in front of an object
@@ -65,6 +67,11 @@ class View:
     #: Numbers of the objects that the data call hidden in part, or cut by the picture's edge.
     hidden: frozenset[int] = frozenset()
 
+    @property
+    def mistaken_px(self) -> FloatArray:
+        """Boxes [n, 4] of what a network took for somebody and is nobody."""
+        return self.furniture_px.get(MISTAKEN, np.zeros((0, 4)))
+
     def turns(self, index: int) -> int:
         """How often an object is drawn lots for: who is hidden in part is rarer, and harder."""
         return _TURNS_OF_HIDDEN if index in self.hidden else 1
@@ -80,7 +87,7 @@ def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
     fit = Letterbox.fit(image.width, image.height, size, "ultralytics")
     rgb = np.full((size[1], size[0], 3), PAD, np.uint8)
     rgb[fit.top : fit.top + fit.height, fit.left : fit.left + fit.width] = cv2.resize(
-        _reduced(image, fit.width, fit.height), (fit.width, fit.height)
+        reduced_picture(image, fit.width, fit.height), (fit.width, fit.height)
     )
     found = data.objects[image.id]
     box = np.array([o.box_px for o in found], np.float64).reshape(-1, 4)
@@ -114,8 +121,8 @@ def usual_places(data: CocoData, size: tuple[int, int]) -> FloatArray:
     return np.concatenate(middles)
 
 
-def _reduced(image: CocoImage, width: int, height: int) -> ImageArray:
-    """The picture at any scale that is not smaller than asked."""
+def reduced_picture(image: CocoImage, width: int, height: int) -> ImageArray:
+    """The picture [h, w, 3], no smaller than asked; DataSetError as `coco`'s."""
     if image.path.suffix.lower() not in (".jpg", ".jpeg"):
         return read_picture(image)
     try:
@@ -198,8 +205,11 @@ class Cutter:
         across, down = self._settings.view
         count = len(view.box_px)
         kind = random.random() - self._settings.around_object
+        mistaken = view.mistaken_px
         if around is not None:
             kind = 0.0  # where objects use to be, if not around this one
+        elif len(mistaken) and random.random() < self._settings.around_mistaken:
+            around = mistaken[int(random.integers(len(mistaken)))]
         if around is not None and len(around):
             box = around
             # Anywhere in the window, but whole; what is larger than the window fills it.

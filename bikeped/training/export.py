@@ -19,9 +19,9 @@ import torch
 from bikeped import __version__
 from bikeped.errors import DetectorError
 from bikeped.files import write_whole
-from bikeped.training.fit import is_small, load_weights
 from bikeped.training.network import STRIDES, Exported, SmallNet
 from bikeped.training.onnx_file import compare, with_metadata
+from bikeped.training.weights import is_small, load_weights
 
 _OPSET = 17
 

@@ -7,21 +7,18 @@ no more than that). Nothing depends on the time that anything takes.
 from __future__ import annotations
 
 import copy
-import io
 import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
-from bikeped.errors import DataSetError, DetectorError
-from bikeped.files import write_whole
+from bikeped.errors import DataSetError
 from bikeped.training.coco import CocoData
 from bikeped.training.crops import (
     LARGEST_WINDOW_PX,
@@ -34,11 +31,11 @@ from bikeped.training.crops import (
 )
 from bikeped.training.device import knows_bfloat16
 from bikeped.training.loss import Truth, detection_loss
+from bikeped.training.mining import MiningSettings, with_mistakes
 from bikeped.training.muon import Muon
 from bikeped.training.network import STRIDES, SmallNet, grid
 from bikeped.training.packing import BLOCK_PX, Packer, PackSettings
 
-FORMAT = "bikeped small detector 2"
 _REPORT_EVERY = 100  #: steps
 _STEEPEST_GRADIENT = 10.0
 
@@ -65,6 +62,7 @@ class FitSettings:
     device: str = "cpu"
     crops: CropSettings = field(default_factory=CropSettings)
     pack: PackSettings = field(default_factory=PackSettings)
+    mining: MiningSettings = field(default_factory=MiningSettings)
 
 
 @dataclass(frozen=True)
@@ -75,6 +73,7 @@ class Fitted:
     names: tuple[str, ...]
     size: tuple[int, int]  #: width and height of the input
     losses: list[dict[str, float]]  #: means over every hundred steps
+    mistakes: list[int]  #: that each look at the pictures found
     seconds: float
 
 
@@ -97,7 +96,9 @@ def fit(
     optimisers = _optimisers(network, settings)
     workers = _workers(network, data, settings)
     losses: list[dict[str, float]] = []
+    mistakes: list[int] = []
     sums: dict[str, float] = {}
+    looks = {round(share * settings.steps) for share in settings.mining.after}
     with ThreadPoolExecutor(len(workers)) as pool:
         ready = [pool.submit(worker.prepare, 0) for worker in workers]
         for step in range(settings.steps):
@@ -107,6 +108,16 @@ def fit(
                     group["lr"] = group["highest"] * share
             for done in ready:
                 done.result()
+            if step in looks:
+                mined, count = with_mistakes(
+                    copy.deepcopy(mean).cpu(), data, shown_size(settings.crops), settings.mining
+                )
+                mistakes.append(count)
+                say(
+                    f"step {step}, {time.monotonic() - began:.0f} s: {count} mistakes to learn from"
+                )
+                for worker in workers:
+                    worker.data = mined
             answers = [pool.submit(worker.learn) for worker in workers]
             for answer in answers:
                 for name, part in answer.result().items():
@@ -130,8 +141,16 @@ def fit(
         tuple(data.categories.values()),
         settings.crops.view,
         losses,
+        mistakes,
         time.monotonic() - began,
     )
+
+
+def shown_size(crops: CropSettings) -> tuple[int, int]:
+    """Width and height of a whole frame at the mean scale of the windows, in whole cells."""
+    scale, cell = sum(crops.scale) / 2, STRIDES[-1]
+    width, height = (max(1, round(side * scale / cell)) * cell for side in crops.view)
+    return width, height
 
 
 def learning_rate(step: int, settings: FitSettings) -> float:
@@ -140,59 +159,6 @@ def learning_rate(step: int, settings: FitSettings) -> float:
         return settings.rate * (step + 1) / settings.warmup
     done = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
     return settings.rate * (0.02 + 0.98 * (1 + math.cos(math.pi * done)) / 2)
-
-
-def save_weights(fitted: Fitted, path: Path, facts: dict[str, Any]) -> None:
-    """Writes the network with its names, input size and `facts` (plain values), whole or not."""
-    file = io.BytesIO()
-    body = {
-        "format": FORMAT,
-        "names": list(fitted.names),
-        "size": list(fitted.size),
-        "facts": facts,
-        "weights": fitted.network.state_dict(),
-    }
-    torch.save(body, file)
-    write_whole(path, file.getvalue())
-
-
-def is_small(path: Path) -> bool:
-    """Whether a file holds weights of the small network; DetectorError where it holds none."""
-    return _read(path).get("format") == FORMAT
-
-
-def load_weights(path: Path) -> tuple[SmallNet, tuple[str, ...], tuple[int, int], dict[str, Any]]:
-    """Network, names, input size (width, height) and facts; DetectorError where it is no such file.
-
-    Nothing in the file is executed.
-    """
-    body = _read(path)
-    if body.get("format") != FORMAT:
-        raise DetectorError(
-            f"{path}: holds no weights of bikeped's small network; name the weights.pt that "
-            "`bikeped model train --network small` wrote"
-        )
-    try:
-        names = tuple(str(name) for name in body["names"])
-        width, height = (int(side) for side in body["size"])
-        network = SmallNet(len(names))
-        network.load_state_dict(body["weights"])
-        return network.eval(), names, (width, height), dict(body["facts"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise DetectorError(f"{path}: its weights do not fit ({_line(error)})") from error
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        body = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise DetectorError(f"{path}: cannot be read ({error.strerror})") from error
-    except Exception as error:  # a damaged file raises anything
-        # Its text may advise to load the file without the protection against what it runs.
-        raise DetectorError(
-            f"{path}: is no file of weights; name the weights.pt that `bikeped model train` wrote"
-        ) from error
-    return body if isinstance(body, dict) else {}
 
 
 def settings_as_dict(settings: FitSettings) -> dict[str, Any]:
@@ -212,7 +178,8 @@ class _Worker:
         self, network: SmallNet, data: CocoData, settings: FitSettings, part: int, cutter: Cutter
     ) -> None:
         self.network = network
-        self._data, self._settings, self._part, self._cutter = data, settings, part, cutter
+        self.data = data  #: read from the next `prepare` on
+        self._settings, self._part, self._cutter = settings, part, cutter
         self._device = next(network.parameters()).device
         self._packer = Packer(settings.pack, settings.crops, cutter)
         self._pool: list[View] = []
@@ -272,13 +239,13 @@ class _Worker:
     def _views(self, numbers: range) -> list[View]:
         """This part's share of the pictures `numbers`."""
         return [
-            read_view(self._data, self._data.images[self._picture(n)], self._settings.crops.view)
+            read_view(self.data, self.data.images[self._picture(n)], self._settings.crops.view)
             for n in numbers[self._part :: self._settings.workers]
         ]
 
     def _picture(self, number: int) -> int:
         """Every picture once a round, in another order each round."""
-        count = len(self._data.images)
+        count = len(self.data.images)
         turn, place = divmod(number, count)
         return int(np.random.default_rng([self._settings.seed, 3, turn]).permutation(count)[place])
 
@@ -389,7 +356,3 @@ def _check(data: CocoData, settings: FitSettings) -> None:
         raise DataSetError(f"{data.source}: categories: is empty; name at least one class")
     if not any(not o.crowd for found in data.objects.values() for o in found):
         raise DataSetError(f"{data.source}: holds no object to learn from")
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

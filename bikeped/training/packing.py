@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bikeped.training.coco import MISTAKEN
 from bikeped.training.crops import Crop, CropSettings, Cutter, View
 from bikeped.types import BoolArray, FloatArray
 
@@ -33,6 +34,9 @@ class PackSettings:
     #: Share of windows around signs, bollards and other things that are nobody, where the data
     #: tell of them: they are what is taken for somebody.
     furniture: float = 0.18
+    #: Share of windows around what a network took for somebody, where it was asked: those things,
+    #: leaves and shadows that do look like somebody.
+    mistaken: float = 0.1
     room: float = 1.25  #: side of a window, in longest sides of its object
     #: How often objects that need 1, 2, 3, 4 blocks are taken: the largest are the easiest.
     taken: tuple[float, ...] = (1.0, 1.0, 0.85, 0.65)
@@ -86,10 +90,12 @@ class Packer:
     ) -> _Pick | None:
         """First the class, then one of its objects; None for a window with nobody in its middle."""
         settings = self._settings
+        if MISTAKEN in things and random.random() < settings.mistaken:
+            return self._mistake(pool, things[MISTAKEN], random)
         what = random.random() - settings.empty
         if what < 0:
             return None
-        if what < settings.furniture and things:
+        if what < settings.furniture and things.keys() - {MISTAKEN}:
             return self._thing(pool, things, random)
         if not any(by_class):
             return None
@@ -101,14 +107,24 @@ class Packer:
         if kind >= len(by_class) or not by_class[kind]:
             kind = int(random.choice([k for k, found in enumerate(by_class) if found]))
         number, index = by_class[kind][int(random.integers(len(by_class[kind])))]
-        box = pool[number].box_px[index]
-        scale = float(random.uniform(*self._scale))
-        longest = float((box[2:] - box[:2]).max()) * scale * settings.room
-        blocks = int(np.clip(np.ceil(longest / BLOCK_PX), 1, settings.side // BLOCK_PX))
-        likely = settings.taken[min(blocks, len(settings.taken)) - 1]
+        pick = self._around(pool[number], pool[number].box_px[index], random)
+        likely = settings.taken[min(pick.blocks, len(settings.taken)) - 1]
         if random.random() >= likely:
             return self._pick(pool, by_class, things, random)
-        return _Pick(pool[number], box, scale, blocks)
+        return pick
+
+    def _around(self, view: View, box: FloatArray, random: np.random.Generator) -> _Pick:
+        """A window that holds `box` [4] and a little of what surrounds it."""
+        scale = float(random.uniform(*self._scale))
+        longest = float((box[2:] - box[:2]).max()) * scale * self._settings.room
+        blocks = int(np.clip(np.ceil(longest / BLOCK_PX), 1, self._settings.side // BLOCK_PX))
+        return _Pick(view, box, scale, blocks)
+
+    def _mistake(
+        self, pool: Sequence[View], mistakes: list[tuple[int, int]], random: np.random.Generator
+    ) -> _Pick:
+        number, index = mistakes[int(random.integers(len(mistakes)))]
+        return self._around(pool[number], pool[number].mistaken_px[index], random)
 
     def _thing(
         self,
@@ -117,7 +133,7 @@ class Packer:
         random: np.random.Generator,
     ) -> _Pick:
         """A window about any spot of a thing: first the kind of thing, then one of them."""
-        kinds = sorted(things)
+        kinds = sorted(things.keys() - {MISTAKEN})
         kind = kinds[int(random.integers(len(kinds)))]
         number, index = things[kind][int(random.integers(len(things[kind])))]
         box = pool[number].furniture_px[kind][index]

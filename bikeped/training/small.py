@@ -13,7 +13,9 @@ from bikeped.training.coco import CocoData
 from bikeped.training.crops import CropSettings
 from bikeped.training.device import knows_bfloat16, named_device
 from bikeped.training.export import export_network
-from bikeped.training.fit import FitSettings, fit, save_weights, settings_as_dict
+from bikeped.training.fit import FitSettings, fit, settings_as_dict
+from bikeped.training.mining import MiningSettings
+from bikeped.training.weights import save_weights
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class SmallOrder:
     seed: int = 0
     device: str = "auto"
     crops: CropSettings = field(default_factory=CropSettings)
+    mining: MiningSettings = field(default_factory=MiningSettings)
     facts: dict[str, Any] = field(default_factory=dict)  #: travel in the weights and the model
 
 
@@ -50,11 +53,12 @@ def train_small(
         bfloat16=knows_bfloat16(device),  # said, so that training.json tells what was done
         device=device,
         crops=order.crops,
+        mining=order.mining,
     )
     fitted = fit(data, settings, progress, say)
     facts = order.facts | {"data_sha256": data.sha256, "steps": order.steps, "seed": order.seed}
     weights, model = out / "weights.pt", out / "model.onnx"
-    save_weights(fitted, weights, facts)
+    save_weights(fitted.network, fitted.names, fitted.size, weights, facts)
     exported = export_network(fitted.network, fitted.names, fitted.size, model, facts)
     return {
         "network": "small",
@@ -71,5 +75,6 @@ def train_small(
         "device": device,
         "torch": torch.__version__,
         "settings": settings_as_dict(settings),
+        "mistakes": fitted.mistakes,
         "losses": fitted.losses,
     }

@@ -20,12 +20,10 @@ from bikeped.training.export import export_network, export_weights  # noqa: E402
 from bikeped.training.fit import (  # noqa: E402
     FitSettings,
     fit,
-    is_small,
     learning_rate,
-    load_weights,
-    save_weights,
 )
 from bikeped.training.packing import PackSettings  # noqa: E402
+from bikeped.training.weights import is_small, load_weights, save_weights  # noqa: E402
 
 CROPS = CropSettings(view=(160, 96), window=(96, 64), light=0, cover=0)
 PACK = PackSettings(side=128, squares=2, pool=4)
@@ -145,7 +143,7 @@ def test_the_rate_rises_then_falls():
 
 def test_weights_come_back_as_they_were(fitted, tmp_path):
     path = tmp_path / "weights.pt"
-    save_weights(fitted, path, {"seed": 3})
+    save_weights(fitted.network, fitted.names, fitted.size, path, {"seed": 3})
     network, names, size, facts = load_weights(path)
     assert (names, size, facts) == (("pedestrian", "cyclist"), (160, 96), {"seed": 3})
     assert is_small(path)
@@ -164,7 +162,7 @@ def test_files_that_are_no_weights_are_named(tmp_path, fitted):
     assert not is_small(path)
     with pytest.raises(DetectorError, match="model train --network small"):
         load_weights(path)
-    save_weights(fitted, path, {})
+    save_weights(fitted.network, fitted.names, fitted.size, path, {})
     body = torch.load(path, weights_only=True)
     torch.save(body | {"names": ["one"]}, path)
     with pytest.raises(DetectorError, match="do not fit"):
@@ -189,7 +187,7 @@ def test_unusable_data_are_named(data, tmp_path):
 
 def test_an_exported_file_is_what_the_detector_loads(fitted, tmp_path):
     weights, model = tmp_path / "weights.pt", tmp_path / "model.onnx"
-    save_weights(fitted, weights, {"seed": 3})
+    save_weights(fitted.network, fitted.names, fitted.size, weights, {"seed": 3})
     summary = export_weights(weights, model)
     assert summary.box_difference_px < 0.01
     assert summary.bytes == model.stat().st_size

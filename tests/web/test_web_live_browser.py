@@ -365,16 +365,17 @@ def test_the_radar_draws_what_the_table_says(told, open_page, until):
     page = open_page(told.url)
     expect(page.locator("#tracks tr")).to_have_count(2)
     tracks = told.watch.now().tracks
-    spot = page.evaluate(
-        """([x, y]) => {
+    # The picture of a state is drawn in the browser's next frame, after its table.
+    page.wait_for_function(
+        """([x, y, colour]) => {
           const canvas = document.querySelector('#radar');
           const {width, height} = canvas.getBoundingClientRect();
           const scale = Math.min((width - 20) / 60, (height - 20) / 36);
           const u = width / 2 + scale * y;
           const v = (height - scale * 36) / 2 + scale * 30 - scale * x;
           const k = canvas.width / width;
-          return [...canvas.getContext('2d').getImageData(u * k, v * k, 1, 1).data];
+          const spot = canvas.getContext('2d').getImageData(u * k, v * k, 1, 1).data;
+          return [...spot].join() === colour;
         }""",
-        [tracks[0].x, tracks[0].y],
+        arg=[tracks[0].x, tracks[0].y, "138,75,0,255"],  # --pedestrian of the light scheme
     )
-    assert spot == [138, 75, 0, 255]  # --pedestrian of the light scheme
