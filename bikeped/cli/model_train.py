@@ -44,7 +44,7 @@ from bikeped.files import make_folder
     type=click.IntRange(64, 4096),
     default=1280,
     show_default=True,
-    help="Side of the square input, pixels; the small network learns at 960 x 544.",
+    help="Side of the square input, pixels; the small network learns at 1280 x 736.",
 )
 @click.option(
     "--weights",
@@ -56,6 +56,12 @@ from bikeped.files import make_folder
     "--steps",
     type=click.IntRange(1, 10_000_000),
     help="Of the small network, in place of --epochs.",
+)
+@click.option(
+    "--mine",
+    is_flag=True,
+    help="The small network only: look at all pictures twice on the way, and learn more often from "
+    "what it took for somebody, and from whom it missed.",
 )
 @click.option(
     "--batch",
@@ -84,6 +90,7 @@ def command(
     weights: Path | None,
     epochs: int,
     steps: int | None,
+    mine: bool,
     batch: int,
     device: str,
     workers: int,
@@ -102,17 +109,21 @@ def command(
     given += [("--weights", weights)] if weights is not None else []
     check_outputs(given, [("--out", name) for name in names])
     if network == "small":
+        from bikeped.training.mining import AFTER, MiningSettings
         from bikeped.training.small import SmallOrder, train_small
 
         _refuse(validation, "--validation")
         _refuse(weights, "--weights")
         count = steps or -(-epochs * len(source.images) // batch)
-        order = SmallOrder(steps=count, pictures=batch, seed=seed, device=device)
+        mining = MiningSettings(after=AFTER if mine else ())
+        order = SmallOrder(count, batch, seed, device, mining=mining)
         with progress_bar("train", count) as progress:
             summary = train_small(source, out, order, progress)
     else:
         from bikeped.training.yolo import YoloOrder, train_yolo
 
+        if mine:
+            raise click.UsageError("--mine is for --network small; leave it out with a YOLO")
         summary = train_yolo(
             source,
             None if validation is None else read_coco(validation),

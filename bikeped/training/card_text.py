@@ -43,6 +43,7 @@ There is more of what is hard to tell than in the streets it is measured on: {mi
 | training | {steps} steps, {training_min:.0f} min |
 | first {packed:.0%} | {squares} squares of {side} pixels{digits}; {things:.0%} around things |
 | then | {windows} windows of 480 x 288 pixels a step |
+| its mistakes | {mistakes} |
 | machine | {machine}; PyTorch {torch} on the CPU, two threads{beside} |
 
 The input is RGB / 255, the picture centred on grey 114, with any sides that are multiples of 32:
@@ -99,6 +100,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         training_min=training["seconds"] / 60,
         steps=settings["steps"],
         windows=settings["pictures"] * settings["windows"],
+        mistakes=_mistakes(training),
         packed=settings["packed"],
         squares=settings["pack"]["squares"],
         side=settings["pack"]["side"],
@@ -126,6 +128,21 @@ def card_text(card: Mapping[str, Any]) -> str:
     if "experiment" in card:
         text += "\n" + _experiment(card["experiment"])
     return text
+
+
+def _mistakes(training: Mapping[str, Any]) -> str:
+    """When it looked at its own pictures, and what came of it."""
+    settings, looks = training["settings"], training["mined"]
+    if not looks:
+        return "not looked for"
+    shares = " and ".join(f"{share:.0%}" for share in settings["mining"]["after"])
+    made = " and ".join(f"{look['mistakes']}" for look in looks)
+    missed = " and ".join(f"{look['missed'] / max(1, look['asked']):.1%}" for look in looks)
+    return (
+        f"looked for in all pictures after {shares} of the steps: {made} times it took something "
+        f"for somebody ({settings['pack']['mistaken']:.0%} of the windows then are about that), "
+        f"and {missed} of the people it missed (they come more often)"
+    )
 
 
 def _measured_by(made: Mapping[str, Any]) -> str:

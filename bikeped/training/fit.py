@@ -29,9 +29,8 @@ from bikeped.training.crops import (
     read_view,
     usual_places,
 )
-from bikeped.training.device import knows_bfloat16
 from bikeped.training.loss import Truth, detection_loss
-from bikeped.training.mining import MiningSettings, with_mistakes
+from bikeped.training.mining import MiningSettings, mine
 from bikeped.training.muon import Muon
 from bikeped.training.network import STRIDES, SmallNet, grid
 from bikeped.training.packing import BLOCK_PX, Packer, PackSettings
@@ -57,8 +56,8 @@ class FitSettings:
     workers: int = 2  #: threads, each with its part of every step
     #: The squares' convolutions in 16 bits: four fifths of the time on what knows it, six times as
     #: long on what does not. The loss and the steps that see no squares are float32, as what ships
-    #: is. None: where the device knows it.
-    bfloat16: bool | None = None
+    #: is. `device.knows_bfloat16` tells.
+    bfloat16: bool = False
     device: str = "cpu"
     crops: CropSettings = field(default_factory=CropSettings)
     pack: PackSettings = field(default_factory=PackSettings)
@@ -73,7 +72,7 @@ class Fitted:
     names: tuple[str, ...]
     size: tuple[int, int]  #: width and height of the input
     losses: list[dict[str, float]]  #: means over every hundred steps
-    mistakes: list[int]  #: that each look at the pictures found
+    mined: list[dict[str, int]]  #: of each look at the pictures: mistakes, missed, asked
     seconds: float
 
 
@@ -96,7 +95,7 @@ def fit(
     optimisers = _optimisers(network, settings)
     workers = _workers(network, data, settings)
     losses: list[dict[str, float]] = []
-    mistakes: list[int] = []
+    mined: list[dict[str, int]] = []
     sums: dict[str, float] = {}
     looks = {round(share * settings.steps) for share in settings.mining.after}
     with ThreadPoolExecutor(len(workers)) as pool:
@@ -109,15 +108,14 @@ def fit(
             for done in ready:
                 done.result()
             if step in looks:
-                mined, count = with_mistakes(
+                look = mine(
                     copy.deepcopy(mean).cpu(), data, shown_size(settings.crops), settings.mining
                 )
-                mistakes.append(count)
-                say(
-                    f"step {step}, {time.monotonic() - began:.0f} s: {count} mistakes to learn from"
-                )
+                data = look.data
+                mined.append({n: getattr(look, n) for n in ("mistakes", "missed", "asked")})
+                say(f"step {step}, {time.monotonic() - began:.0f} s: {mined[-1]}")
                 for worker in workers:
-                    worker.data = mined
+                    worker.data = data
             answers = [pool.submit(worker.learn) for worker in workers]
             for answer in answers:
                 for name, part in answer.result().items():
@@ -141,7 +139,7 @@ def fit(
         tuple(data.categories.values()),
         settings.crops.view,
         losses,
-        mistakes,
+        mined,
         time.monotonic() - began,
     )
 
@@ -185,8 +183,6 @@ class _Worker:
         self._pool: list[View] = []
         self._ready: tuple[torch.Tensor, list[Truth]] = (torch.zeros(0), [])
         self._packed = True
-        asked = settings.bfloat16
-        self._bfloat16 = knows_bfloat16(settings.device) if asked is None else asked
 
     def prepare(self, step: int) -> None:
         """Reads and cuts what `learn` will learn from."""
@@ -202,7 +198,7 @@ class _Worker:
         """Leaves the gradient in the copy; returns the parts of the loss."""
         torch.set_num_threads(1)
         pictures, truths = self._ready
-        half = self._bfloat16 and self._packed
+        half = self._settings.bfloat16 and self._packed
         with torch.autocast(self._device.type, torch.bfloat16, enabled=half):
             score, edge = self.network(pictures)
         centre, stride = grid(pictures.shape[3], pictures.shape[2])
@@ -256,8 +252,8 @@ def _workers(network: SmallNet, data: CocoData, settings: FitSettings) -> list[_
     copies = [network]
     for _ in range(settings.workers - 1):
         other = copy.deepcopy(network)
-        for mine, shared in zip(other.parameters(), network.parameters(), strict=True):
-            mine.data = shared.data
+        for own, shared in zip(other.parameters(), network.parameters(), strict=True):
+            own.data = shared.data
         copies.append(other)
     return [_Worker(n, data, settings, part, cutter) for part, n in enumerate(copies)]
 

@@ -50,7 +50,7 @@ def train_small(
         warmup=min(100, max(1, order.steps // 10)),
         workers=2 if on_cpu and order.pictures % 2 == 0 else 1,
         seed=order.seed,
-        bfloat16=knows_bfloat16(device),  # said, so that training.json tells what was done
+        bfloat16=knows_bfloat16(device),
         device=device,
         crops=order.crops,
         mining=order.mining,
@@ -75,6 +75,6 @@ def train_small(
         "device": device,
         "torch": torch.__version__,
         "settings": settings_as_dict(settings),
-        "mistakes": fitted.mistakes,
+        "mined": fitted.mined,
         "losses": fitted.losses,
     }

@@ -58,13 +58,14 @@ def test_onnx_is_exported_to_an_engine_only(tmp_path, capsys):
 @with_torch
 def test_the_small_network_from_data_to_model(data, tmp_path, capsys):
     out = tmp_path / "out"
-    order = ["--network", "small", "--steps", "2", "--batch", "2", "--device", "cpu"]
+    order = ["--network", "small", "--steps", "2", "--batch", "2", "--device", "cpu", "--mine"]
     assert main(["model", "train", str(data), "--out", str(out), *order, "--json", "-"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert json.loads((out / "training.json").read_text()) == summary
     assert summary["names"] == ["person", "bicycle", "car"]
     assert (summary["pictures"], summary["objects"], summary["size"]) == (4, 4, [1280, 736])
     assert summary["settings"]["steps"] == 2
+    assert len(summary["mined"]) == 1  # two steps: both looks before the second
     assert (out / "model.onnx").stat().st_size == summary["model_bytes"] < 4e6
 
     again = tmp_path / "again.onnx"
@@ -100,6 +101,8 @@ def test_options_of_the_other_network_are_refused(data, tmp_path, capsys):
     assert "--weights is for a YOLO" in said(capsys)
     assert main([*base, "--device", "moon"]) == 2
     assert "--device moon" in said(capsys)
+    assert main([*base[:-1], "yolov9-t", "--mine"]) == 2
+    assert "--mine is for --network small" in said(capsys)
 
 
 @with_torch
