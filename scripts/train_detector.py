@@ -42,6 +42,7 @@ from bikeped.training.card import (
     summary,
     sweep,
 )
+from bikeped.training.card_spread import spread
 from bikeped.training.card_text import card_text
 from bikeped.training.coco import read_coco
 from bikeped.training.crops import CropSettings
@@ -60,24 +61,25 @@ from bikeped.training.weights import load_weights
 from bikeped.types import Kind
 
 #: The steps take less than an hour on two cores that multiply bfloat16 themselves.
-PICTURES, STEPS = 4600, 10800
+PICTURES, STEPS = 5000, 11200
 #: Width and height of the whole frame as the shipped network is shown it: what two cores answer 30
 #: times a second. It learns on pictures 1280 across, made a little smaller and larger about this.
 SHOWN = (1152, 672)
 CROPS = CropSettings(scale=(0.8, 1.02))
 MINING = MiningSettings(after=AFTER)
-#: What is taken for somebody stands in a street: there are twice as many as where four share one.
-TRAINING = DrawnSettings(pictures=PICTURES, seed=1, a_street=2)
-VALIDATION = DrawnTest(pictures=1200, seed=8_000_001)
+TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
 #: As many as that one street, of which come four, does not decide how many false ones there are.
-TEST = DrawnTest(pictures=1200, seed=9_000_001)
-#: A second test like the first: how far apart they lie is how exact either is.
-AGAIN = replace(TEST, seed=9_800_001)
+VALIDATION = (
+    DrawnTest(pictures=2400, seed=8_000_001),
+    DrawnTest(pictures=1200, seed=9_000_001),
+    DrawnTest(pictures=1200, seed=9_800_001),
+)
+TEST = DrawnTest(pictures=2400, seed=9_200_001)
 OTHER_LENSES = replace(TEST, pictures=300, seed=9_500_001, own_lens=True)
 #: The shipped confidence of a kind is the lowest with at most this many false ones a 100 frames on
 #: the validation pictures: of pedestrians and cyclists together the one that is aimed at, shared so
 #: that both are found as often as is aimed at there.
-MOST_FALSE = {Kind.PEDESTRIAN: 0.6, Kind.CYCLIST: 0.4, Kind.VEHICLE: 3.0}
+MOST_FALSE = {Kind.PEDESTRIAN: 0.75, Kind.CYCLIST: 0.2, Kind.VEHICLE: 3.0}
 GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 
 #: Of the experiment: both networks get as much of everything. Steps of half the size, so that there
@@ -135,9 +137,10 @@ def build(out: Path, pictures: int, steps: int) -> None:
     export_network(network, names, SHOWN, out / "plain.onnx", facts)
     quantise(out / "plain.onnx", shown_pictures(whole, SHOWN), out / "plain-int8.onnx")
     plain = DetectionConfig(model=str((out / "plain-int8.onnx").resolve()), confidence=0.04)
-    (validation,), _ = drawn_test(
-        [plain], loaded, VALIDATION, counted("validated", VALIDATION.pictures)
-    )
+    validation = []
+    for test in VALIDATION:
+        (seen,), _ = drawn_test([plain], loaded, test, counted("validated", test.pictures))
+        validation += seen
     chosen = [choose_confidence(validation, kind, GRID, MOST_FALSE[kind]) for kind in Kind]
     shipped = loaded.config.detection.confidence
     shift_scores(network, chosen, shipped)
@@ -171,6 +174,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
             "seed_data": TRAINING.seed,
             "configured_share": TRAINING.configured,
             "usual_mix": asdict(USUAL_MIX),
+            "validation_pictures": sum(test.pictures for test in VALIDATION),
             "most_false": {kind.label: most for kind, most in MOST_FALSE.items()},
             "drawing": read(out / "drawing.json"),
             "training": within(out, read(training / "training.json")),
@@ -191,7 +195,6 @@ def measured(folder: Path, loaded: LoadedConfig) -> dict[str, Any]:
     sections: dict[str, Any] = {}
     for name, test, files in (
         ("configured_camera", TEST, {"": "small-int8.onnx", "_float": "small.onnx"}),
-        ("again", AGAIN, {"": "small-int8.onnx"}),
         ("other_lenses", OTHER_LENSES, {"": "small-int8.onnx"}),
     ):
         models = [shipped_as(loaded, folder / file) for file in files.values()]
@@ -202,6 +205,7 @@ def measured(folder: Path, loaded: LoadedConfig) -> dict[str, Any]:
             sections[name + end] = {
                 "seed": test.seed,
                 **numbers,
+                "spread": spread(seen, shipped),
                 "lights": by_light(seen, lights, shipped),
             }
     return sections

@@ -61,7 +61,7 @@ from bikeped.files import make_folder
     "--mine",
     is_flag=True,
     help="The small network only: look at all pictures twice on the way, and learn more often from "
-    "what it took for somebody, and from whom it missed.",
+    "what it took for somebody.",
 )
 @click.option(
     "--batch",

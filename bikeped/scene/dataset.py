@@ -27,7 +27,7 @@ CATEGORIES = [{"id": kind.value + 1, "name": kind.label} for kind in Kind]
 #: learn from or to be judged by: it is kept and marked as a crowd, which COCO's measures ignore.
 MIN_VISIBLE = 0.3
 MIN_SIDE_PX = 5.0
-_A_STREET = 4  #: pictures that share a street, which costs more than who is on it
+_PER_STREET = 4  #: pictures that share a street, which costs more than who is on it
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,15 @@ def pictures(
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
     mix: Mix = USUAL_MIX,
-    a_street: int = _A_STREET,
 ) -> Iterator[DrawnPicture]:
     """`count` drawn pictures with their objects: random scenarios, lights, weathers and places.
 
     `camera`: for all of them; None draws a camera for every street (`lens`: fisheye or
-    rectilinear). `mix`: of who and what is there. `a_street`: pictures that share one. Equal
-    arguments give equal pictures; a larger `count` begins with the same ones.
+    rectilinear). `mix`: of who and what is there. Equal arguments give equal pictures; a
+    larger `count` begins with the same ones.
     """
     for number in range(count):
-        street = seed * 1_000_003 + number // a_street
+        street = seed * 1_000_003 + number // _PER_STREET
         conditions = random_conditions(street, mix.clutter)
         view = camera or random_camera(street, size, lens)
         rng = np.random.default_rng((seed, number, 59))
@@ -79,7 +78,6 @@ def write_dataset(
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
     mix: Mix = USUAL_MIX,
-    a_street: int = _A_STREET,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Writes `folder`/images/*.jpg and `folder`/annotations.json; returns the latter.
@@ -107,7 +105,7 @@ def write_dataset(
         (partial / "images").mkdir()
         images: list[dict[str, Any]] = []
         notes: list[dict[str, Any]] = []
-        drawn = pictures(count, seed, camera, size=size, lens=lens, mix=mix, a_street=a_street)
+        drawn = pictures(count, seed, camera, size=size, lens=lens, mix=mix)
         for number, one in enumerate(drawn):
             name = f"{number:06d}.jpg"
             quality = 78 + (seed * 7 + number * 5) % 18

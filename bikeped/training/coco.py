@@ -65,7 +65,6 @@ class CocoObject:
     polygons: tuple[FloatArray, ...] = field(repr=False, default=(), compare=False)
     distance_m: float | None = None
     visible: float | None = None
-    missed: bool = False  #: by the network that learns from it (`bikeped.training.mining`)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
 _LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
 _WHOLE = 0.97  #: of an object that shows, or it is hidden in part
 _TURNS_OF_HIDDEN = 4
-_MORE_OF_MISSED = 4
 LARGEST_WINDOW_PX = 256  #: of those whose size is asked for one by one
 _NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest in grey levels
 
@@ -38,7 +37,7 @@ class CropSettings:
     around_object: float = 0.65  #: share of windows that are cut around an object
     around_usual: float = 0.2  #: share cut where some other picture has an object
     #: Share cut around a mistake, of the windows of pictures where a network made one.
-    around_mistaken: float = 0.25
+    around_mistaken: float = 0.5
     scale: tuple[float, float] = (0.72, 1.1)
     flip: float = 0.5
     cover: float = 0.15  #: share of windows with something in front of an object
@@ -67,7 +66,6 @@ class View:
     furniture_px: Mapping[str, FloatArray] = field(default_factory=dict)
     #: Numbers of the objects that the data call hidden in part, or cut by the picture's edge.
     hidden: frozenset[int] = frozenset()
-    missed: frozenset[int] = frozenset()  #: of those that a network did not find
 
     @property
     def mistaken_px(self) -> FloatArray:
@@ -75,10 +73,8 @@ class View:
         return self.furniture_px.get(MISTAKEN, np.zeros((0, 4)))
 
     def turns(self, index: int) -> int:
-        """How often an object is drawn lots for: who is hidden in part is rarer, and harder, and
-        who was missed needs another look."""
-        turns = _TURNS_OF_HIDDEN if index in self.hidden else 1
-        return turns + _MORE_OF_MISSED if index in self.missed else turns
+        """How often an object is drawn lots for: who is hidden in part is rarer, and harder."""
+        return _TURNS_OF_HIDDEN if index in self.hidden else 1
 
 
 def class_ids(data: CocoData) -> dict[int, int]:
@@ -103,7 +99,6 @@ def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
         np.array([o.crowd for o in found], np.int64),
         _furniture(image, fit),
         frozenset(i for i, o in enumerate(found) if o.visible is not None and o.visible < _WHOLE),
-        frozenset(i for i, o in enumerate(found) if o.missed),
     )
 
 

@@ -40,7 +40,6 @@ class DrawnSettings:
     pictures: int = 5000
     seed: int = 1
     part: int = 20  #: pictures that share a camera
-    a_street: int = 4  #: pictures that share a street: fewer make more streets, and take longer
     configured: float = 0.9  #: share of parts seen by the configured camera
     large: float = 0.75  #: share of parts drawn at 1920 x 1080, the others at 1280 x 720
     lens: str = "fisheye"  #: of the other cameras: fisheye or rectilinear
@@ -124,5 +123,4 @@ def _draw(
         size=size,
         lens=settings.lens,
         mix=settings.mix,
-        a_street=settings.a_street,
     )

@@ -30,7 +30,7 @@ from bikeped.training.crops import (
     usual_places,
 )
 from bikeped.training.loss import Truth, detection_loss
-from bikeped.training.mining import MiningSettings, mine
+from bikeped.training.mining import MiningSettings, with_mistakes
 from bikeped.training.muon import Muon
 from bikeped.training.network import STRIDES, SmallNet, grid
 from bikeped.training.packing import BLOCK_PX, Packer, PackSettings
@@ -72,7 +72,7 @@ class Fitted:
     names: tuple[str, ...]
     size: tuple[int, int]  #: width and height of the input
     losses: list[dict[str, float]]  #: means over every hundred steps
-    mined: list[dict[str, int]]  #: of each look at the pictures: mistakes, missed, asked
+    mistakes: list[int]  #: that each look at the pictures found
     seconds: float
 
 
@@ -95,7 +95,7 @@ def fit(
     optimisers = _optimisers(network, settings)
     workers = _workers(network, data, settings)
     losses: list[dict[str, float]] = []
-    mined: list[dict[str, int]] = []
+    mistakes: list[int] = []
     sums: dict[str, float] = {}
     looks = {round(share * settings.steps) for share in settings.mining.after}
     with ThreadPoolExecutor(len(workers)) as pool:
@@ -108,14 +108,15 @@ def fit(
             for done in ready:
                 done.result()
             if step in looks:
-                look = mine(
+                mined, count = with_mistakes(
                     copy.deepcopy(mean).cpu(), data, shown_size(settings.crops), settings.mining
                 )
-                data = look.data
-                mined.append({n: getattr(look, n) for n in ("mistakes", "missed", "asked")})
-                say(f"step {step}, {time.monotonic() - began:.0f} s: {mined[-1]}")
+                mistakes.append(count)
+                say(
+                    f"step {step}, {time.monotonic() - began:.0f} s: {count} mistakes to learn from"
+                )
                 for worker in workers:
-                    worker.data = data
+                    worker.data = mined
             answers = [pool.submit(worker.learn) for worker in workers]
             for answer in answers:
                 for name, part in answer.result().items():
@@ -139,7 +140,7 @@ def fit(
         tuple(data.categories.values()),
         settings.crops.view,
         losses,
-        mined,
+        mistakes,
         time.monotonic() - began,
     )
 

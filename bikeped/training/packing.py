@@ -36,7 +36,7 @@ class PackSettings:
     furniture: float = 0.18
     #: Share of windows around what a network took for somebody, where it was asked: those things,
     #: leaves and shadows that do look like somebody.
-    mistaken: float = 0.07
+    mistaken: float = 0.1
     room: float = 1.25  #: side of a window, in longest sides of its object
     #: How often objects that need 1, 2, 3, 4 blocks are taken: the largest are the easiest.
     taken: tuple[float, ...] = (1.0, 1.0, 0.85, 0.65)

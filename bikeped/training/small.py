@@ -75,6 +75,6 @@ def train_small(
         "device": device,
         "torch": torch.__version__,
         "settings": settings_as_dict(settings),
-        "mined": fitted.mined,
+        "mistakes": fitted.mistakes,
         "losses": fitted.losses,
     }

@@ -65,7 +65,7 @@ def test_the_small_network_from_data_to_model(data, tmp_path, capsys):
     assert summary["names"] == ["person", "bicycle", "car"]
     assert (summary["pictures"], summary["objects"], summary["size"]) == (4, 4, [1280, 736])
     assert summary["settings"]["steps"] == 2
-    assert len(summary["mined"]) == 1  # two steps: both looks before the second
+    assert len(summary["mistakes"]) == 1  # two steps: both looks before the second
     assert (out / "model.onnx").stat().st_size == summary["model_bytes"] < 4e6
 
     again = tmp_path / "again.onnx"

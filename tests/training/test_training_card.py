@@ -21,6 +21,7 @@ from bikeped.training.card import (
     summary,
     sweep,
 )
+from bikeped.training.card_spread import spread
 from bikeped.types import Detections, Kind
 
 NAN = math.nan
@@ -155,6 +156,28 @@ def test_the_confidence_is_the_lowest_that_keeps_the_promise():
     assert choose_confidence(sights(), PED, grid, 0) == 0.1
     assert choose_confidence(sights(), CYC, [0.1], 1.0) == 0.1
     assert [row["confidence"] for row in sweep(sights(), grid)] == grid
+
+
+def test_how_exact_the_figures_are_follows_from_the_streets():
+    # Streets of four pictures: in half of them all are found, in the others nobody, and a false one
+    # in each picture of every tenth street.
+    def picture(number):
+        street = number // 4
+        false = [Sight(PED, NAN, False, 0.9, NAN)] if street % 10 == 0 else []
+        other = [Sight(PED, NAN, False, 0.9, NAN, True), Sight(CYC, NAN, False, 0.1, NAN)]
+        return [Sight(PED, 5.0, street % 2 == 0, 0.8, 0.1), *false, *other]
+
+    numbers = spread([picture(n) for n in range(400)], 0.5)
+    low, high = numbers["pedestrian"]
+    # A hundred streets, each a throw of a coin: 0.5 +- 1.96 x 0.05.
+    assert (low, high) == pytest.approx((0.402, 0.598), abs=0.015)
+    low, high = numbers["false_pedestrian_or_cyclist_per_100_frames"]
+    # 10 +- 1.96 x 3, skewed.
+    assert (low, high) == pytest.approx((5, 16), abs=1.01)
+    assert numbers["cyclist"] is None
+    alone = spread([picture(n) for n in range(400)], 0.5, a_street=1)["pedestrian"]
+    assert alone == pytest.approx([0.45, 0.55], abs=0.01)
+    assert spread(sights(), 0.25) == spread(sights(), 0.25)
 
 
 @pytest.mark.slow
