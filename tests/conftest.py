@@ -108,6 +108,7 @@ class Proxy:
         self.accepted = asyncio.Event()
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
+        self._accepting: set[asyncio.Task[None]] = set()
         self._client_sides: list[asyncio.StreamWriter] = []
         self._broker_sides: list[asyncio.StreamWriter] = []
 
@@ -117,6 +118,10 @@ class Proxy:
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._client_sides.append(writer)
+        task = asyncio.current_task()
+        assert task is not None
+        self._accepting.add(task)
+        task.add_done_callback(self._accepting.discard)
         up_reader, up_writer = await asyncio.open_connection("127.0.0.1", self.target_port)
         self._broker_sides.append(up_writer)
         for source, sink in ((reader, up_writer), (up_reader, writer)):
@@ -149,6 +154,10 @@ class Proxy:
     async def close(self) -> None:
         assert self._server is not None
         self._server.close()
+        # Who comes as the door closes is let in some turns of the loop later; then all are known.
+        for _ in range(5):
+            await asyncio.sleep(0)
+        await asyncio.gather(*self._accepting, return_exceptions=True)
         self.abort_clients()
         self.abort_broker_side()
         for task in self._tasks:
