@@ -77,8 +77,8 @@ VALIDATION = (
 TEST = DrawnTest(pictures=2400, seed=9_200_001)
 OTHER_LENSES = replace(TEST, pictures=300, seed=9_500_001, own_lens=True)
 #: The shipped confidence of a kind is the lowest with at most this many false ones a 100 frames on
-#: the validation pictures: of pedestrians and cyclists together the one that is aimed at, shared so
-#: that both are found as often as is aimed at there.
+#: the validation pictures: of pedestrians and cyclists together a little less than the one that is
+#: aimed at, shared so that both are found as often as is aimed at there.
 MOST_FALSE = {Kind.PEDESTRIAN: 0.75, Kind.CYCLIST: 0.2, Kind.VEHICLE: 3.0}
 GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 

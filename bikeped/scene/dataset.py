@@ -27,7 +27,7 @@ CATEGORIES = [{"id": kind.value + 1, "name": kind.label} for kind in Kind]
 #: learn from or to be judged by: it is kept and marked as a crowd, which COCO's measures ignore.
 MIN_VISIBLE = 0.3
 MIN_SIDE_PX = 5.0
-_PER_STREET = 4  #: pictures that share a street, which costs more than who is on it
+PICTURES_A_STREET = 4  #: pictures that share a street, which costs more than who is on it
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def pictures(
     larger `count` begins with the same ones.
     """
     for number in range(count):
-        street = seed * 1_000_003 + number // _PER_STREET
+        street = seed * 1_000_003 + number // PICTURES_A_STREET
         conditions = random_conditions(street, mix.clutter)
         view = camera or random_camera(street, size, lens)
         rng = np.random.default_rng((seed, number, 59))

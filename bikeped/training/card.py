@@ -70,6 +70,17 @@ class Sight:
     loose: bool = False  #: a detection that overlaps somebody of its kind, but too little
     visible: float = 1.0  #: share of the object that shows
 
+    @property
+    def extra(self) -> str | None:
+        """What a detection that found nobody is: `another_kind`, `loose` or `false`."""
+        if not np.isnan(self.distance_m):
+            return None
+        return "another_kind" if self.on_other else "loose" if self.loose else "false"
+
+    def found_at(self, confidence: float) -> bool:
+        """Whether the object is found by a detection of at least this confidence."""
+        return self.found and self.confidence >= confidence
+
 
 def drawn_test(
     models: Sequence[DetectionConfig],
@@ -127,11 +138,7 @@ def summary(seen: Sequence[Sequence[Sight]], confidence: float) -> dict[str, Any
             {"from_m": low, "to_m": high, **_numbers(mine, low, high, confidence)}
             for low, high in pairwise(RINGS_M)
         ]
-        extra = [
-            "another_kind" if s.on_other else "loose" if s.loose else "false"
-            for s in rows
-            if s.kind == kind and np.isnan(s.distance_m) and s.confidence >= confidence
-        ]
+        extra = [s.extra for s in rows if s.kind == kind and s.confidence >= confidence]
         result["kinds"][kind.label] = {
             "within_15_m": _numbers(mine, 0, NEAR_M, confidence),
             "within_15_m_mostly_visible": _numbers(
@@ -193,7 +200,7 @@ def choose_confidence(
 
 def _numbers(mine: list[Sight], low: float, high: float, confidence: float) -> dict[str, Any]:
     inside = [s for s in mine if low <= s.distance_m < high]
-    hits = [s for s in inside if s.found and s.confidence >= confidence]
+    hits = [s for s in inside if s.found_at(confidence)]
     errors = np.array([s.error_m for s in hits if np.isfinite(s.error_m)])
     return {
         "objects": len(inside),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bikeped.scene.dataset import PICTURES_A_STREET
 from bikeped.training.card import NEAR_M, Sight
 from bikeped.types import FloatArray, Kind
 
@@ -15,7 +16,9 @@ _DRAWS = 2000
 _LOW, _HIGH = 2.5, 97.5  #: percentiles
 
 
-def spread(seen: Sequence[Sequence[Sight]], confidence: float, a_street: int = 4) -> dict[str, Any]:
+def spread(
+    seen: Sequence[Sequence[Sight]], confidence: float, a_street: int = PICTURES_A_STREET
+) -> dict[str, Any]:
     """Where the recalls within 15 m of pedestrians and cyclists and the false ones of both a 100
     frames lie, lowest and highest, in 95 of 100 tests of as many streets.
 
@@ -44,12 +47,8 @@ def _counts(picture: Sequence[Sight], confidence: float) -> list[int]:
     row = []
     for kind in _KINDS:
         mine = [s for s in picture if s.kind == kind and s.distance_m < NEAR_M]
-        row += [sum(s.found and s.confidence >= confidence for s in mine), len(mine)]
-    false = [
-        s
-        for s in picture
-        if s.kind in _KINDS and np.isnan(s.distance_m) and not s.on_other and not s.loose
-    ]
+        row += [sum(s.found_at(confidence) for s in mine), len(mine)]
+    false = [s for s in picture if s.kind in _KINDS and s.extra == "false"]
     return [*row, sum(s.confidence >= confidence for s in false), 1]
 
 

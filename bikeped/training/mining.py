@@ -28,13 +28,13 @@ from bikeped.training.crops import reduced_picture
 from bikeped.training.export import export_network
 from bikeped.training.network import SmallNet
 from bikeped.training.quantise import quantise, shown_pictures
-from bikeped.types import FloatArray, Kind
+from bikeped.types import Float32Array, FloatArray, Kind
 
 #: Shares of the steps: while it still learns fast, and again before it sees plain windows.
 AFTER = (0.4, 0.7)
 #: Mistakes of these kinds make a false alarm.
 _KINDS = (Kind.PEDESTRIAN, Kind.CYCLIST)
-_Look = tuple[CocoImage, FloatArray]  #: a picture and the boxes [n, 4] of everybody in it
+_Look = tuple[CocoImage, Float32Array]  #: a picture and the boxes [n, 4] of everybody in it
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ def with_mistakes(
     return replace(data, images=images), sum(len(boxes) for boxes in found.values())
 
 
-def _boxes(data: CocoData, image: CocoImage) -> FloatArray:
-    return np.array([o.box_px for o in data.objects[image.id]], np.float64).reshape(-1, 4)
+def _boxes(data: CocoData, image: CocoImage) -> Float32Array:
+    return np.array([o.box_px for o in data.objects[image.id]], np.float32).reshape(-1, 4)
 
 
 def _mistakes(
@@ -88,7 +88,7 @@ def _mistakes(
     for image, people in looks:
         rgb = reduced_picture(image, *detector.decode_size(image.width, image.height))
         seen = detector.infer(rgb, image.width, image.height).detections
-        overlap = overlap_matrix(seen.box_px, people.astype(np.float32)).max(axis=1, initial=0.0)
+        overlap = overlap_matrix(seen.box_px, people).max(axis=1, initial=0.0)
         mistaken = (overlap < settings.overlap) & np.isin(seen.kind, _KINDS)
         found[image.id] = seen.box_px[mistaken].astype(np.float64)
     return found

@@ -54,6 +54,22 @@ class _Pick:
     blocks: int
 
 
+@dataclass(frozen=True)
+class _Lots:
+    """What a window may be about, each as number of its picture in the pool and number there:
+    objects by class, things by kind, and what a network took for somebody."""
+
+    by_class: list[list[tuple[int, int]]]
+    things: dict[str, list[tuple[int, int]]]
+    mistakes: list[tuple[int, int]]
+
+    @classmethod
+    def of(cls, pool: Sequence[View]) -> _Lots:
+        things = _by_thing(pool)
+        mistakes = things.pop(MISTAKEN, [])
+        return cls(_by_class(pool), things, mistakes)
+
+
 class Packer:
     """Fills squares from a pool of pictures."""
 
@@ -65,10 +81,10 @@ class Packer:
         side = self._settings.side // BLOCK_PX
         free = np.ones((count, side, side), np.bool_)
         placed: list[list[tuple[int, int, Crop]]] = [[] for _ in range(count)]
-        by_class, things = _by_class(pool), _by_thing(pool)
+        lots = _Lots.of(pool)
         misses = 0
         while free.any():
-            pick = self._pick(pool, by_class, things, random) if misses < _TRIES else None
+            pick = self._pick(pool, lots, random) if misses < _TRIES else None
             if pick is None:
                 pick = _Pick(pool[int(random.integers(len(pool)))], np.zeros(0), 1.0, 1)
             spot = first_fit(free, pick.blocks)
@@ -81,22 +97,18 @@ class Packer:
             placed[square].append((row, column, self._cut(pick, random)))
         return [_joined(tiles, self._settings.side) for tiles in placed]
 
-    def _pick(
-        self,
-        pool: Sequence[View],
-        by_class: list[list[tuple[int, int]]],
-        things: dict[str, list[tuple[int, int]]],
-        random: np.random.Generator,
-    ) -> _Pick | None:
+    def _pick(self, pool: Sequence[View], lots: _Lots, random: np.random.Generator) -> _Pick | None:
         """First the class, then one of its objects; None for a window with nobody in its middle."""
         settings = self._settings
-        if MISTAKEN in things and random.random() < settings.mistaken:
-            return self._mistake(pool, things[MISTAKEN], random)
+        if lots.mistakes and random.random() < settings.mistaken:
+            number, index = lots.mistakes[int(random.integers(len(lots.mistakes)))]
+            return self._around(pool[number], pool[number].mistaken_px[index], random)
         what = random.random() - settings.empty
         if what < 0:
             return None
-        if what < settings.furniture and things.keys() - {MISTAKEN}:
-            return self._thing(pool, things, random)
+        if what < settings.furniture and lots.things:
+            return self._thing(pool, lots.things, random)
+        by_class = lots.by_class
         if not any(by_class):
             return None
         share = random.random() - np.cumsum(settings.classes)
@@ -110,7 +122,7 @@ class Packer:
         pick = self._around(pool[number], pool[number].box_px[index], random)
         likely = settings.taken[min(pick.blocks, len(settings.taken)) - 1]
         if random.random() >= likely:
-            return self._pick(pool, by_class, things, random)
+            return self._pick(pool, lots, random)
         return pick
 
     def _around(self, view: View, box: FloatArray, random: np.random.Generator) -> _Pick:
@@ -120,12 +132,6 @@ class Packer:
         blocks = int(np.clip(np.ceil(longest / BLOCK_PX), 1, self._settings.side // BLOCK_PX))
         return _Pick(view, box, scale, blocks)
 
-    def _mistake(
-        self, pool: Sequence[View], mistakes: list[tuple[int, int]], random: np.random.Generator
-    ) -> _Pick:
-        number, index = mistakes[int(random.integers(len(mistakes)))]
-        return self._around(pool[number], pool[number].mistaken_px[index], random)
-
     def _thing(
         self,
         pool: Sequence[View],
@@ -133,7 +139,7 @@ class Packer:
         random: np.random.Generator,
     ) -> _Pick:
         """A window about any spot of a thing: first the kind of thing, then one of them."""
-        kinds = sorted(things.keys() - {MISTAKEN})
+        kinds = sorted(things)
         kind = kinds[int(random.integers(len(kinds)))]
         number, index = things[kind][int(random.integers(len(things[kind])))]
         box = pool[number].furniture_px[kind][index]
