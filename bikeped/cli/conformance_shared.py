@@ -127,8 +127,8 @@ def begin(
 
 def load_suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
     """The scenarios of a folder (None: the bundled ones) before the configured camera."""
-    from bikeped.conformance.scenario import bundled_folder, load_scenarios
     from bikeped.conformance.suite import Suite
+    from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 
     return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
 

@@ -53,8 +53,8 @@ def command(
 
     Without a configured detector the bundled one looks at the pictures.
     """
-    from bikeped.conformance.scenario import load_scenario
     from bikeped.demo import bundled_scenario, format_summary, summarise
+    from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.models import BUNDLED, NOT_FOR_STREETS
     from bikeped.scene import Conditions, ScenePainter, scene_camera, sidecar_path
     from bikeped.scene.clip import frame_times, write_clip

@@ -25,7 +25,7 @@ from bikeped.errors import BikepedError, GeometryError, ScenarioError
 from bikeped.files import write_whole
 
 if TYPE_CHECKING:
-    from bikeped.conformance.scenario import Scenario
+    from bikeped.lab.scenarios.scenario import Scenario
     from bikeped.scene import DrawnObject, SceneCamera, ScenePainter
     from bikeped.types import ImageArray
 
@@ -271,7 +271,7 @@ def _camera(loaded: LoadedConfig, size: tuple[int, int]) -> SceneCamera:
 
 def _scenario(name: str) -> Scenario:
     """A scenario file, or a bundled scenario by its name or its file's."""
-    from bikeped.conformance.scenario import bundled_folder, load_scenario, load_scenarios
+    from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario, load_scenarios
 
     path = Path(name)
     if path.suffix in {".yaml", ".yml"} or path.exists():

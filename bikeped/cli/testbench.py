@@ -15,9 +15,9 @@ from bikeped.cli.conformance_shared import scenarios_option
 from bikeped.cli.governance_tables import print_contest
 from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, load_config
-from bikeped.conformance.scenario import Scenario, bundled_folder, load_scenarios
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
+from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 
 if TYPE_CHECKING:
     from bikeped.web.testbench_settings import Bench

@@ -19,10 +19,10 @@ from bikeped.config import DecisionConfig
 from bikeped.config.provenance import decision_hash
 from bikeped.conformance.gates import all_hold, check
 from bikeped.conformance.metrics import Metrics, number
-from bikeped.conformance.scenario import Scenario, dump_scenario
 from bikeped.conformance.suite import Suite
 from bikeped.conformance.truth import BRAKING, TruthSettings
 from bikeped.errors import BikepedError, ScenarioError
+from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
 from bikeped.types import BoolArray, State
 
 _TRUTH_RANGE = {"cpa_radius_m": 25.0, "stopping_margin": 10.0, "ttc_bound_s": 60.0}

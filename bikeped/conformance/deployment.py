@@ -26,10 +26,10 @@ from bikeped.conformance.experiments import Progress, percent, quiet
 from bikeped.conformance.metrics import TruthFrames
 from bikeped.conformance.montecarlo import Observed, Plan, simulate_views, summaries
 from bikeped.conformance.perception import RecallModel, Seen, see
-from bikeped.conformance.scenario import SIZES_M, Agent, Scenario
 from bikeped.conformance.tables import Result, Table
 from bikeped.conformance.truth import judge_truth
 from bikeped.geometry import CameraPose, GroundCamera, Lens
+from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.types import FloatArray
 
 FOOT_M = 0.3048

@@ -21,9 +21,9 @@ from bikeped.conformance.figure_style import (
     plain,
     stem_of,
 )
-from bikeped.conformance.scenario import Agent, Scenario
 from bikeped.conformance.strip import onsets
 from bikeped.conformance.suite import Suite
+from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.types import FloatArray
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.conformance.scenario import Agent, Scenario
+from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind
 
 #: Distracted pedestrian's perception-reaction time, s (paper, section 4.5).

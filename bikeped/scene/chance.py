@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.conformance.scenario import SIZES_M, Agent, Scenario
 from bikeped.errors import GeometryError
 from bikeped.geometry import CameraPose, Lens
+from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.scene.camera import DEFAULT_POSE, SceneCamera, lens_camera, rectilinear_camera
 
 _DURATION_S = 6.0

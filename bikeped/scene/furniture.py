@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bikeped.conformance.scenario import SIZES_M
+from bikeped.lab.scenarios.scenario import SIZES_M
 from bikeped.scene.mesh import Builder, Mesh, Point, Rgb
 from bikeped.scene.place import Fixture, House
 from bikeped.scene.vehicles import vehicle

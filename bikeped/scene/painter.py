@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bikeped.conformance.scenario import Agent, Scenario
+from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.scene.backdrop import Standing, backdrop
 from bikeped.scene.camera import SceneCamera
 from bikeped.scene.conditions import Conditions

@@ -29,8 +29,8 @@ from bikeped.conformance.report import (
     tested_html,
     verdict_html,
 )
-from bikeped.conformance.scenario import Scenario
 from bikeped.conformance.tables import Result
+from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.web.testbench import configurations
 from bikeped.web.testbench_contest import runs
 from bikeped.web.testbench_playback import coverage, playback

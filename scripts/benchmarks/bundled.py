@@ -18,7 +18,7 @@ FRAMES, DISTINCT = 240, 24
 def run(figures: Figures) -> None:
     """Frames a second on this machine's cores, recording on disk to decision."""
     from bikeped.config import load_config
-    from bikeped.conformance.scenario import bundled_folder, load_scenario
+    from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
     from bikeped.models import BUNDLED_FILE
     from bikeped.scene import ScenePainter, scene_camera
     from bikeped.scene.avi import AviWriter

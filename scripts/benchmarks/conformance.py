@@ -17,10 +17,10 @@ def run(figures: Figures) -> None:
     """Seven configurations over the bundled scenarios, with and without localisation error."""
     from benchmarks.figures import in_turns
     from bikeped.config import load_config, rule_settings
-    from bikeped.conformance.scenario import bundled_folder, load_scenarios
     from bikeped.conformance.simulate import SIMULATION_TRACKER
     from bikeped.conformance.suite import CONFIGURATIONS, Suite, compare
     from bikeped.decision import Decider
+    from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
     from bikeped.tracking import LaneTracker
 
     loaded = load_config()

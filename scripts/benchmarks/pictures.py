@@ -9,8 +9,8 @@ from functools import cache
 def street_4k(count: int) -> list[bytes]:
     """`count` frames of the demo's crossing at 3840 x 2160, spread over its length."""
     from bikeped.config import load_config
-    from bikeped.conformance.scenario import load_scenario
     from bikeped.demo import bundled_scenario
+    from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.scene import Conditions, ScenePainter, scene_camera
     from bikeped.scene.clip import encode_jpeg
 

@@ -6,7 +6,7 @@ import cv2
 
 from benchmarks.figures import Figures, in_turns
 from bikeped.config import load_config
-from bikeped.conformance.scenario import bundled_folder, load_scenario
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.scene import Conditions, SceneCamera, ScenePainter, random_scenario, scene_camera
 from bikeped.scene.backdrop import backdrop
 from bikeped.scene.camera import rays

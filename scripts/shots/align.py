@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 
 from bikeped.config import framing, ground_camera, load_config
-from bikeped.conformance.scenario import load_scenario
 from bikeped.demo import bundled_scenario
 from bikeped.geometry import CameraPose
+from bikeped.lab.scenarios.scenario import load_scenario
 from bikeped.scene import Conditions, SceneCamera, ScenePainter
 
 if TYPE_CHECKING:

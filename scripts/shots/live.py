@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.config import LoadedConfig, load_config
-from bikeped.conformance.scenario import parse_scenario
 from bikeped.detection.base import DetectorAnswer
+from bikeped.lab.scenarios.scenario import parse_scenario
 from bikeped.scene import Conditions, ScenePainter, scene_camera
 from bikeped.scene.clip import read_sidecar, sidecar_path, write_clip
 from bikeped.service.replay import replay

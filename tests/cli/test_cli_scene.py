@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 from bikeped.cli.main import main
-from bikeped.conformance.scenario import bundled_folder
+from bikeped.lab.scenarios.scenario import bundled_folder
 from bikeped.scene import read_sidecar, sidecar_path
 
 SMALL = ("--size", "320x180")

@@ -14,7 +14,7 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from bikeped.cli.main import main
 from bikeped.config import load_config
-from bikeped.conformance.scenario import bundled_folder, load_scenarios
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.web.security import Access
 from bikeped.web.server import make_pages
 from bikeped.web.testbench import add_testbench

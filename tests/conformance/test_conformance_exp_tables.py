@@ -17,10 +17,10 @@ from bikeped.conformance import deployment as dep
 from bikeped.conformance import experiments as ex
 from bikeped.conformance import optimizer as opt
 from bikeped.conformance.perception import RecallModel, localise, see
-from bikeped.conformance.scenario import SIZES_M, bundled_folder, load_scenarios
 from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.truth import judge_truth
 from bikeped.errors import ScenarioError
+from bikeped.lab.scenarios.scenario import SIZES_M, bundled_folder, load_scenarios
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 NAMES = ("Bike Approaches Ped", "Multiple VRUs", "Safe Crossing", "Swerving Cyclist")

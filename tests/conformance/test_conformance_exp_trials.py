@@ -15,10 +15,10 @@ from bikeped.conformance import montecarlo as mc
 from bikeped.conformance.latency import DELAYS_MS, PREDICTORS, delay_frames, sweep, sweep_with_loss
 from bikeped.conformance.metrics import measure
 from bikeped.conformance.perception import RecallModel, misses, trial_generator
-from bikeped.conformance.scenario import bundled_folder, load_scenarios
 from bikeped.conformance.simulate import Scene, delayed, rows_of, states, track
 from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.errors import BikepedError
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 NAMES = ("Bike Approaches Ped", "Multiple VRUs", "Safe Crossing", "Swerving Cyclist")

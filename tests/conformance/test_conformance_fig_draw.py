@@ -12,10 +12,10 @@ from bikeped.config import DecisionConfig, load_config
 from bikeped.conformance.figure_style import Sheet, stem_of
 from bikeped.conformance.figures import FIGURES, draw_all
 from bikeped.conformance.plan import draw_plan
-from bikeped.conformance.scenario import parse_scenario
 from bikeped.conformance.strip import draw_strip, onsets, spans
 from bikeped.conformance.suite import Suite
 from bikeped.errors import BikepedError
+from bikeped.lab.scenarios.scenario import parse_scenario
 
 MARKUP = """
 name: "Fast & <script>alert(1)</script> $x^2$ ../up"

@@ -7,10 +7,10 @@ import pytest
 
 from bikeped.config import rule_settings
 from bikeped.conformance.perception import RecallModel, misses, trial_generator
-from bikeped.conformance.scenario import bundled_folder, load_scenarios
 from bikeped.conformance.simulate import FPS, SIMULATION_TRACKER, Scene, rows_of, states, track
 from bikeped.conformance.suite import CONFIGURATIONS
 from bikeped.decision import Decider
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.tracking import Tracker, predict
 from bikeped.types import GroundPoints, State
 

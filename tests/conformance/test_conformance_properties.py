@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from bikeped.config import rule_settings
 from bikeped.conformance.perception import SIMULATION_POSE
-from bikeped.conformance.scenario import SIZES_M, Agent, Scenario
 from bikeped.conformance.simulate import Scene, rows_of, states, track
 from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.truth import judge_truth
+from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.types import State
 
 ALERT = int(State.ALERT)

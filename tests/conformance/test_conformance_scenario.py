@@ -9,7 +9,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.conformance.scenario import (
+from bikeped.errors import ScenarioError
+from bikeped.lab.scenarios.scenario import (
     HAZARDS,
     SIZES_M,
     Agent,
@@ -19,7 +20,6 @@ from bikeped.conformance.scenario import (
     load_scenarios,
     parse_scenario,
 )
-from bikeped.errors import ScenarioError
 
 PARALLEL = """\
 name: Parallel Paths

@@ -5,8 +5,8 @@ import pytest
 
 from bikeped.config import rule_settings
 from bikeped.conformance.perception import SIMULATION_POSE
-from bikeped.conformance.scenario import HAZARDS, SIZES_M, bundled_folder, load_scenarios
 from bikeped.conformance.suite import CONFIGURATIONS, compare
+from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, bundled_folder, load_scenarios
 from bikeped.types import State
 
 SET = {

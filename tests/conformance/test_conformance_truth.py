@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.conformance.scenario import (
+from bikeped.conformance.truth import TruthSettings, judge_truth, with_ttc_bound
+from bikeped.lab.scenarios.scenario import (
     SIZES_M,
     Agent,
     Scenario,
     bundled_folder,
     load_scenarios,
 )
-from bikeped.conformance.truth import TruthSettings, judge_truth, with_ttc_bound
 
 INF = math.inf
 BUNDLED = {s.name: s for s in load_scenarios(bundled_folder())}

@@ -5,8 +5,8 @@ import pytest
 from drawn_eyes import boxes
 
 from bikeped.config import load_config
-from bikeped.conformance.scenario import load_scenario
 from bikeped.demo import bundled_scenario, format_summary, summarise
+from bikeped.lab.scenarios.scenario import load_scenario
 from bikeped.scene import Conditions, ScenePainter, scene_camera
 from bikeped.service.judge import Judge
 

@@ -10,9 +10,9 @@ import pytest
 from bikeped.cli.main import main
 from bikeped.config import load_config, road_region
 from bikeped.config.sections import DetectionConfig
-from bikeped.conformance.scenario import bundled_folder, load_scenario
 from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.models import (
     BUNDLED,
     BUNDLED_FILE,

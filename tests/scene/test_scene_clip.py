@@ -11,8 +11,8 @@ import pytest
 
 from bikeped.capture import VideoSource
 from bikeped.config import load_config
-from bikeped.conformance.scenario import bundled_folder, load_scenario
 from bikeped.errors import BikepedError, CaptureError
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.scene import (
     Conditions,
     ScenePainter,

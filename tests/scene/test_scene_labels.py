@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.config import load_config
-from bikeped.conformance.scenario import SIZES_M, Agent, Scenario
 from bikeped.geometry import GroundCamera
+from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.scene import Conditions, DrawnObject, SceneCamera, ScenePainter, scene_camera
 from bikeped.scene.conditions import lighting
 from bikeped.scene.people import Looks, person

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from bikeped.config import load_config
-from bikeped.conformance.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenario
 from bikeped.errors import GeometryError, ScenarioError
 from bikeped.geometry import Lens
+from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenario
 from bikeped.scene import (
     LIGHTS,
     Conditions,

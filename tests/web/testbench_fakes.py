@@ -10,7 +10,7 @@ import msgspec
 from web_fakes import OPEN
 
 from bikeped.config import load_config
-from bikeped.conformance.scenario import bundled_folder, load_scenarios
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.web.server import make_pages
 from bikeped.web.testbench import add_testbench
 from bikeped.web.testbench_settings import Bench, in_force
