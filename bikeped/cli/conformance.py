@@ -97,7 +97,7 @@ def compare(
 ) -> None:
     """The named configurations and rules side by side, with and without localisation error."""
     from bikeped.conformance.experiments import compare_table
-    from bikeped.conformance.suite import CONFIGURATIONS
+    from bikeped.lab.simulation.suite import CONFIGURATIONS
 
     configurations = dict(CONFIGURATIONS)
     for item in added:
@@ -174,7 +174,7 @@ def montecarlo(
     The configuration's own decision is `configured` when it is none of the named ones.
     """
     from bikeped.conformance import montecarlo as mc
-    from bikeped.conformance.suite import CONFIGURATIONS
+    from bikeped.lab.simulation.suite import CONFIGURATIONS
 
     curve = None if curve_path is None else mc.load_recall_curve(curve_path)
     loaded, suite = begin(config_path, overrides, scenarios_dir)

@@ -181,8 +181,8 @@ def contest(
     --truth and --scenario. Needs no camera, no model and no access to the pole.
     """
     from bikeped.conformance import contest as contesting
-    from bikeped.conformance.suite import DEFAULT_TRUTH
     from bikeped.lab.scenarios.scenario import load_scenario
+    from bikeped.lab.simulation.suite import DEFAULT_TRUTH
 
     if not (overrides or added or truth or bound):
         raise BikepedError(

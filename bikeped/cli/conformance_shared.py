@@ -16,8 +16,8 @@ from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
-    from bikeped.conformance.suite import Suite
     from bikeped.conformance.tables import Cell, Result, Table
+    from bikeped.lab.simulation.suite import Suite
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -127,8 +127,8 @@ def begin(
 
 def load_suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
     """The scenarios of a folder (None: the bundled ones) before the configured camera."""
-    from bikeped.conformance.suite import Suite
     from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+    from bikeped.lab.simulation.suite import Suite
 
     return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
 

@@ -19,9 +19,9 @@ import numpy as np
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig, config_hash, rule_settings
 from bikeped.config.provenance import decision_hash
-from bikeped.conformance.simulate import Run, verdicts
-from bikeped.conformance.suite import Suite, camera_json
 from bikeped.errors import BikepedError
+from bikeped.lab.simulation.simulate import Run, verdicts
+from bikeped.lab.simulation.suite import Suite, camera_json
 from bikeped.types import FloatArray, State
 
 #: Decimals of a record: 0.1 mm, 0.1 ms.

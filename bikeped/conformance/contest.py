@@ -18,11 +18,11 @@ import numpy.typing as npt
 from bikeped.config import DecisionConfig
 from bikeped.config.provenance import decision_hash
 from bikeped.conformance.gates import all_hold, check
-from bikeped.conformance.metrics import Metrics, number
-from bikeped.conformance.suite import Suite
-from bikeped.conformance.truth import BRAKING, TruthSettings
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
+from bikeped.lab.simulation.metrics import Metrics, number
+from bikeped.lab.simulation.suite import Suite
+from bikeped.lab.simulation.truth import BRAKING, TruthSettings
 from bikeped.types import BoolArray, State
 
 _TRUTH_RANGE = {"cpa_radius_m": 25.0, "stopping_margin": 10.0, "ttc_bound_s": 60.0}

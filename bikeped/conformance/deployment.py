@@ -23,13 +23,13 @@ import numpy as np
 
 from bikeped.config import DecisionConfig
 from bikeped.conformance.experiments import Progress, percent, quiet
-from bikeped.conformance.metrics import TruthFrames
 from bikeped.conformance.montecarlo import Observed, Plan, simulate_views, summaries
-from bikeped.conformance.perception import RecallModel, Seen, see
 from bikeped.conformance.tables import Result, Table
-from bikeped.conformance.truth import judge_truth
 from bikeped.geometry import CameraPose, GroundCamera, Lens
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
+from bikeped.lab.simulation.metrics import TruthFrames
+from bikeped.lab.simulation.perception import RecallModel, Seen, see
+from bikeped.lab.simulation.truth import judge_truth
 from bikeped.types import FloatArray
 
 FOOT_M = 0.3048

@@ -16,13 +16,13 @@ import numpy as np
 
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
-from bikeped.conformance.metrics import Metrics, measure, number
-from bikeped.conformance.perception import error_table, localise
-from bikeped.conformance.suite import CONFIGURATIONS, Suite, camera_json, compare, compare_json
 from bikeped.conformance.tables import Cell, Result, Table
-from bikeped.conformance.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, TruthSettings
 from bikeped.errors import ScenarioError
 from bikeped.lab.scenarios.scenario import SIZES_M
+from bikeped.lab.simulation.metrics import Metrics, measure, number
+from bikeped.lab.simulation.perception import error_table, localise
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, camera_json, compare, compare_json
+from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, TruthSettings
 from bikeped.types import BoolArray, State
 
 Progress = Callable[[int], None]

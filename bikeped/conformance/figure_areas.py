@@ -21,7 +21,7 @@ from bikeped.conformance.figure_style import (
     plain,
     reals,
 )
-from bikeped.conformance.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
+from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
 from bikeped.types import FloatArray
 
 Data = Mapping[str, Any]

@@ -22,7 +22,7 @@ from bikeped.conformance.figure_style import (
     reals,
 )
 from bikeped.conformance.gates import SENSITIVITY_MIN, SPECIFICITY_MIN
-from bikeped.conformance.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
+from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
 from bikeped.types import FloatArray
 
 if TYPE_CHECKING:

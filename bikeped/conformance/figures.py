@@ -9,8 +9,8 @@ from typing import Any
 
 from bikeped.conformance import figure_areas, figure_lines
 from bikeped.conformance.figure_style import require_matplotlib
-from bikeped.conformance.suite import Suite
 from bikeped.errors import BikepedError
+from bikeped.lab.simulation.suite import Suite
 
 Draw = Callable[[Mapping[str, Any], str, str, Path], list[Path]]
 

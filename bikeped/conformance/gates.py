@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bikeped.conformance.metrics import Metrics, number
-from bikeped.conformance.truth import PEDESTRIAN_PRT_S
+from bikeped.lab.simulation.metrics import Metrics, number
+from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S
 
 SENSITIVITY_MIN = 0.90
 SPECIFICITY_MIN = 0.90

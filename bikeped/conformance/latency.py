@@ -10,7 +10,6 @@ from typing import Any
 
 from bikeped.config import DecisionConfig
 from bikeped.conformance.experiments import Progress, percent, quiet, seconds
-from bikeped.conformance.metrics import TruthFrames
 from bikeped.conformance.montecarlo import (
     TRIALS,
     Plan,
@@ -19,10 +18,11 @@ from bikeped.conformance.montecarlo import (
     sorted_suite,
     summaries,
 )
-from bikeped.conformance.perception import RecallModel
-from bikeped.conformance.simulate import FPS, track
-from bikeped.conformance.suite import Suite
 from bikeped.conformance.tables import Result, Table
+from bikeped.lab.simulation.metrics import TruthFrames
+from bikeped.lab.simulation.perception import RecallModel
+from bikeped.lab.simulation.simulate import FPS, track
+from bikeped.lab.simulation.suite import Suite
 
 #: 0 to 500 ms in steps of one frame.
 DELAYS_MS = tuple(range(0, 500, 33))

@@ -20,13 +20,13 @@ import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.conformance.experiments import Progress, percent, quiet
-from bikeped.conformance.metrics import Metrics, TruthFrames, measure
-from bikeped.conformance.perception import RecallMode, RecallModel, Seen, lost, trial_generator
-from bikeped.conformance.simulate import Scene, Tracked, delayed, rows_of, states, track
-from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.tables import Result, Table
 from bikeped.conformance.workers import workers
 from bikeped.errors import BikepedError
+from bikeped.lab.simulation.metrics import Metrics, TruthFrames, measure
+from bikeped.lab.simulation.perception import RecallMode, RecallModel, Seen, lost, trial_generator
+from bikeped.lab.simulation.simulate import Scene, Tracked, delayed, rows_of, states, track
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.types import BoolArray, FloatArray, KindArray
 
 TRIALS = 50

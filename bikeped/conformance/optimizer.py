@@ -18,11 +18,11 @@ from scipy.optimize import Bounds, differential_evolution
 
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.conformance.experiments import SHOWN_COLUMNS, Progress, quiet, shown
-from bikeped.conformance.metrics import Metrics, measure
-from bikeped.conformance.simulate import states
-from bikeped.conformance.suite import Suite
 from bikeped.conformance.tables import Result, Table
 from bikeped.errors import ScenarioError
+from bikeped.lab.simulation.metrics import Metrics, measure
+from bikeped.lab.simulation.simulate import states
+from bikeped.lab.simulation.suite import Suite
 from bikeped.types import FloatArray
 
 SEED = 42

@@ -22,8 +22,8 @@ from bikeped.conformance.figure_style import (
     stem_of,
 )
 from bikeped.conformance.strip import onsets
-from bikeped.conformance.suite import Suite
 from bikeped.lab.scenarios.scenario import Agent, Scenario
+from bikeped.lab.simulation.suite import Suite
 from bikeped.types import FloatArray
 
 if TYPE_CHECKING:

@@ -23,10 +23,10 @@ from bikeped.config.provenance import (
     provenance_path,
 )
 from bikeped.conformance.gates import check
-from bikeped.conformance.metrics import Metrics
-from bikeped.conformance.suite import Suite, camera_json
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.files import write_like
+from bikeped.lab.simulation.metrics import Metrics
+from bikeped.lab.simulation.suite import Suite, camera_json
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,11 @@ from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.conformance import deployment, experiments, latency, montecarlo, optimizer
 from bikeped.conformance.experiments import Progress, provenance, quiet
-from bikeped.conformance.perception import RecallModel
-from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.conformance.tables import Result, Table
 from bikeped.conformance.workers import workers
 from bikeped.files import make_folder, write_whole
+from bikeped.lab.simulation.perception import RecallModel
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 
 #: Parts of bikeped whose source decides what an experiment gives.
 _CODE = (*DECIDING_CODE, *MEASURING_CODE, "config", "types")

@@ -19,9 +19,9 @@ from bikeped.conformance.figure_style import (
     plain,
     stem_of,
 )
-from bikeped.conformance.simulate import verdicts
-from bikeped.conformance.suite import Suite
-from bikeped.conformance.truth import PEDESTRIAN_PRT_S, Truth
+from bikeped.lab.simulation.simulate import verdicts
+from bikeped.lab.simulation.suite import Suite
+from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, Truth
 from bikeped.types import BoolArray, FloatArray, State
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import DecisionConfig, LoadedConfig
-from bikeped.conformance.metrics import Metrics, measure
-from bikeped.conformance.perception import Seen
-from bikeped.conformance.simulate import FPS
-from bikeped.conformance.suite import Suite
+from bikeped.lab.simulation.metrics import Metrics, measure
+from bikeped.lab.simulation.perception import Seen
+from bikeped.lab.simulation.simulate import FPS
+from bikeped.lab.simulation.suite import Suite
 from bikeped.pixels.matching import MIN_VISIBLE, match
 from bikeped.pixels.run import PixelRun
 from bikeped.scene import DrawnObject

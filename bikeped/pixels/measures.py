@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from bikeped.config import LoadedConfig
-from bikeped.conformance.perception import Seen
+from bikeped.lab.simulation.perception import Seen
 from bikeped.pixels.matching import MIN_VISIBLE, match
 from bikeped.pixels.run import PixelRun
 from bikeped.service.viewpoint import Viewpoint

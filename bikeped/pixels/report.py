@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from bikeped.conformance.experiments import SHOWN_COLUMNS, percent, shown
-from bikeped.conformance.metrics import Metrics, number
-from bikeped.conformance.perception import error_table
-from bikeped.conformance.suite import Suite
 from bikeped.conformance.tables import Cell, Result, Table
+from bikeped.lab.simulation.metrics import Metrics, number
+from bikeped.lab.simulation.perception import error_table
+from bikeped.lab.simulation.suite import Suite
 from bikeped.pixels.ladder import Rung
 from bikeped.pixels.matching import MIN_IOU, MIN_VISIBLE
 from bikeped.pixels.measures import Sights, localisation_rows, recall_rows

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import LoadedConfig
-from bikeped.conformance.simulate import FPS
 from bikeped.conformance.workers import workers
 from bikeped.feedback import SignalLogic
 from bikeped.lab.scenarios.scenario import Scenario
+from bikeped.lab.simulation.simulate import FPS
 from bikeped.pixels.drawn import DrawnSource
 from bikeped.scene import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.service.announcer import Announcer

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.conformance.perception import SIZE_BOUNDS_PX2
 from bikeped.errors import BikepedError
+from bikeped.lab.simulation.perception import SIZE_BOUNDS_PX2
 from bikeped.types import BoolArray, Float32Array, FloatArray, IntArray
 
 MOST_BOXES = 100  #: of one picture and class, as COCO has it

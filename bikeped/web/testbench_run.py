@@ -19,15 +19,15 @@ import msgspec
 
 from bikeped.config import LoadedConfig
 from bikeped.conformance.deployment import fuse
-from bikeped.conformance.metrics import TruthFrames
 from bikeped.conformance.montecarlo import Observed, Plan, simulate_trials, summaries
-from bikeped.conformance.perception import RecallModel, Seen, see
-from bikeped.conformance.simulate import Run, Scene, Tracked, delayed, rows_of, track
-from bikeped.conformance.suite import Suite
-from bikeped.conformance.truth import Truth, TruthSettings, judge_truth
 from bikeped.errors import BikepedError
 from bikeped.geometry import CameraPose
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
+from bikeped.lab.simulation.metrics import TruthFrames
+from bikeped.lab.simulation.perception import RecallModel, Seen, see
+from bikeped.lab.simulation.simulate import Run, Scene, Tracked, delayed, rows_of, track
+from bikeped.lab.simulation.suite import Suite
+from bikeped.lab.simulation.truth import Truth, TruthSettings, judge_truth
 from bikeped.web.testbench_settings import (
     Bench,
     Delay,

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from benchmarks.figures import Figures
     from bikeped.config import LoadedConfig
-    from bikeped.conformance.suite import Suite
+    from bikeped.lab.simulation.suite import Suite
 
 
 def run(figures: Figures) -> None:
     """Seven configurations over the bundled scenarios, with and without localisation error."""
     from benchmarks.figures import in_turns
     from bikeped.config import load_config, rule_settings
-    from bikeped.conformance.simulate import SIMULATION_TRACKER
-    from bikeped.conformance.suite import CONFIGURATIONS, Suite, compare
     from bikeped.decision import Decider
     from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+    from bikeped.lab.simulation.simulate import SIMULATION_TRACKER
+    from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare
     from bikeped.tracking import LaneTracker
 
     loaded = load_config()

@@ -35,8 +35,8 @@ def run(figures: Figures) -> None:
         return
     from benchmarks.figures import in_turns
     from bikeped.config import DecisionConfig, load_config
-    from bikeped.conformance.suite import Suite
     from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+    from bikeped.lab.simulation.suite import Suite
 
     loaded, scenarios = load_config(), load_scenarios(bundled_folder())
     one = [s for s in scenarios if s.name == "Bike Approaches Ped"]

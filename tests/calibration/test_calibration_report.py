@@ -25,9 +25,9 @@ from bikeped.calibration.results import cautions_of
 from bikeped.calibration.views import Refused
 from bikeped.calibration.write import Field, calibration_data, field_of_view, write_calibration
 from bikeped.config import ground_camera, load_config
-from bikeped.conformance.suite import Suite
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens
+from bikeped.lab.simulation.suite import Suite
 from bikeped.service.viewpoint import Viewpoint
 
 FRAMING = Framing(3840, 2160, 3840, 3500)

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from bikeped.cli.main import main
-from bikeped.conformance.suite import CONFIGURATIONS
 from bikeped.lab.scenarios.scenario import bundled_folder
+from bikeped.lab.simulation.suite import CONFIGURATIONS
 
 CONFIG = str(Path(__file__).parents[2] / "config.yaml")
 FILES = ("swerving-cyclist.yaml", "safe-crossing.yaml")

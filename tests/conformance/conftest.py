@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from bikeped.config import load_config
-from bikeped.conformance.suite import Suite
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.simulation.suite import Suite
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 

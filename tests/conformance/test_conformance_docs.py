@@ -7,9 +7,9 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from bikeped.conformance.simulate import FPS
-from bikeped.conformance.truth import judge_truth
 from bikeped.lab.scenarios.scenario import HAZARDS, bundled_folder, load_scenarios
+from bikeped.lab.simulation.simulate import FPS
+from bikeped.lab.simulation.truth import judge_truth
 
 PAGE = Path(__file__).parents[2] / "docs" / "scenarios.md"
 FOLDER = "../bikeped/conformance/scenarios"

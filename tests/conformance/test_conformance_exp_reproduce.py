@@ -16,10 +16,10 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.conformance import reproduce as rep
-from bikeped.conformance.suite import Suite
 from bikeped.conformance.tables import Result
 from bikeped.errors import BikepedError
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.simulation.suite import Suite
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 LOADED = load_config(CONFIG)

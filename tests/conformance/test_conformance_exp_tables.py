@@ -16,11 +16,11 @@ from bikeped.config.candidate import parse_decision
 from bikeped.conformance import deployment as dep
 from bikeped.conformance import experiments as ex
 from bikeped.conformance import optimizer as opt
-from bikeped.conformance.perception import RecallModel, localise, see
-from bikeped.conformance.suite import CONFIGURATIONS, Suite
-from bikeped.conformance.truth import judge_truth
 from bikeped.errors import ScenarioError
 from bikeped.lab.scenarios.scenario import SIZES_M, bundled_folder, load_scenarios
+from bikeped.lab.simulation.perception import RecallModel, localise, see
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
+from bikeped.lab.simulation.truth import judge_truth
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 NAMES = ("Bike Approaches Ped", "Multiple VRUs", "Safe Crossing", "Swerving Cyclist")

@@ -13,12 +13,12 @@ import pytest
 from bikeped.config import load_config, rule_settings
 from bikeped.conformance import montecarlo as mc
 from bikeped.conformance.latency import DELAYS_MS, PREDICTORS, delay_frames, sweep, sweep_with_loss
-from bikeped.conformance.metrics import measure
-from bikeped.conformance.perception import RecallModel, misses, trial_generator
-from bikeped.conformance.simulate import Scene, delayed, rows_of, states, track
-from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.errors import BikepedError
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.simulation.metrics import measure
+from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator
+from bikeped.lab.simulation.simulate import Scene, delayed, rows_of, states, track
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 NAMES = ("Bike Approaches Ped", "Multiple VRUs", "Safe Crossing", "Swerving Cyclist")

@@ -13,9 +13,9 @@ from bikeped.conformance.figure_style import Sheet, stem_of
 from bikeped.conformance.figures import FIGURES, draw_all
 from bikeped.conformance.plan import draw_plan
 from bikeped.conformance.strip import draw_strip, onsets, spans
-from bikeped.conformance.suite import Suite
 from bikeped.errors import BikepedError
 from bikeped.lab.scenarios.scenario import parse_scenario
+from bikeped.lab.simulation.suite import Suite
 
 MARKUP = """
 name: "Fast & <script>alert(1)</script> $x^2$ ../up"

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from bikeped.config import load_config, rule_settings
-from bikeped.conformance.simulate import FPS, SIMULATION_TRACKER
-from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.decision import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.simulation.simulate import FPS, SIMULATION_TRACKER
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.tracking import Tracker
 from bikeped.types import GroundPoints
 

@@ -12,9 +12,9 @@ from bikeped.config import DecisionConfig, load_config
 from bikeped.conformance import register
 from bikeped.conformance.audit import write_audit
 from bikeped.conformance.contest import apply_bounds, contest, parse_truth, with_scenarios
-from bikeped.conformance.suite import DEFAULT_TRUTH, Suite
 from bikeped.errors import BikepedError
 from bikeped.lab.scenarios.scenario import parse_scenario
+from bikeped.lab.simulation.suite import DEFAULT_TRUTH, Suite
 from bikeped.types import State
 
 ONE = """

@@ -15,9 +15,9 @@ from bikeped.config.candidate import parse_decision
 from bikeped.config.provenance import check_provenance, decision_hash
 from bikeped.conformance import promote as promoting
 from bikeped.conformance.gates import all_hold, check, check_figures
-from bikeped.conformance.suite import Suite
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.lab.scenarios.scenario import load_scenarios
+from bikeped.lab.simulation.suite import Suite
 
 SCENARIO = """
 name: Straight On

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bikeped.config import rule_settings
-from bikeped.conformance.perception import RecallModel, misses, trial_generator
-from bikeped.conformance.simulate import FPS, SIMULATION_TRACKER, Scene, rows_of, states, track
-from bikeped.conformance.suite import CONFIGURATIONS
 from bikeped.decision import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator
+from bikeped.lab.simulation.simulate import FPS, SIMULATION_TRACKER, Scene, rows_of, states, track
+from bikeped.lab.simulation.suite import CONFIGURATIONS
 from bikeped.tracking import Tracker, predict
 from bikeped.types import GroundPoints, State
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.conformance.metrics import TruthFrames, measure, number
-from bikeped.conformance.truth import Truth
+from bikeped.lab.simulation.metrics import TruthFrames, measure, number
+from bikeped.lab.simulation.truth import Truth
 from bikeped.types import State
 
 INF, NAN = math.inf, math.nan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bikeped.conformance.montecarlo import Observed
-from bikeped.conformance.perception import (
+from bikeped.lab.simulation.perception import (
     AVERAGE_PRECISION,
     OVERALL_RECALL,
     RecallModel,
@@ -16,7 +16,7 @@ from bikeped.conformance.perception import (
     misses,
     trial_generator,
 )
-from bikeped.conformance.suite import CONFIGURATIONS
+from bikeped.lab.simulation.suite import CONFIGURATIONS
 from bikeped.types import Kind
 
 PAPER = {

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.config import rule_settings
-from bikeped.conformance.perception import SIMULATION_POSE
-from bikeped.conformance.simulate import Scene, rows_of, states, track
-from bikeped.conformance.suite import CONFIGURATIONS, Suite
-from bikeped.conformance.truth import judge_truth
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
+from bikeped.lab.simulation.perception import SIMULATION_POSE
+from bikeped.lab.simulation.simulate import Scene, rows_of, states, track
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
+from bikeped.lab.simulation.truth import judge_truth
 from bikeped.types import State
 
 ALERT = int(State.ALERT)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bikeped.config import rule_settings
-from bikeped.conformance.perception import SIMULATION_POSE
-from bikeped.conformance.suite import CONFIGURATIONS, compare
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, bundled_folder, load_scenarios
+from bikeped.lab.simulation.perception import SIMULATION_POSE
+from bikeped.lab.simulation.suite import CONFIGURATIONS, compare
 from bikeped.types import State
 
 SET = {

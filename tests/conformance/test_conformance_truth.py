@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.conformance.truth import TruthSettings, judge_truth, with_ttc_bound
 from bikeped.lab.scenarios.scenario import (
     SIZES_M,
     Agent,
@@ -14,6 +13,7 @@ from bikeped.lab.scenarios.scenario import (
     bundled_folder,
     load_scenarios,
 )
+from bikeped.lab.simulation.truth import TruthSettings, judge_truth, with_ttc_bound
 
 INF = math.inf
 BUNDLED = {s.name: s for s in load_scenarios(bundled_folder())}

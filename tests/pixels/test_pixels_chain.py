@@ -9,9 +9,9 @@ import pytest
 from drawn_eyes import OracleEye
 
 from bikeped.config import LoadedConfig, load_config
-from bikeped.conformance.suite import Suite
-from bikeped.conformance.truth import judge_truth
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
+from bikeped.lab.simulation.suite import Suite
+from bikeped.lab.simulation.truth import judge_truth
 from bikeped.pixels.ladder import ladder
 from bikeped.pixels.matching import MIN_VISIBLE
 from bikeped.pixels.measures import localisation_rows, recall_rows, sights

@@ -12,10 +12,10 @@ from coco_sets import CATEGORIES, annotation, edit, write_set
 from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config.sections import DetectionConfig
-from bikeped.conformance.perception import AREA_SCALE
 from bikeped.detection.facts import ModelMetadata
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DataSetError, DetectorError
+from bikeped.lab.simulation.perception import AREA_SCALE
 from bikeped.scene.dataset import write_dataset
 from bikeped.training.coco import read_coco
 from bikeped.training.evaluate import (

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.conformance.montecarlo import load_recall_curve
-from bikeped.conformance.perception import RecallModel
 from bikeped.errors import BikepedError, DataSetError
+from bikeped.lab.simulation.perception import RecallModel
 from bikeped.training.evaluate import write_curve
 from bikeped.training.measures import Curve, Found, Truth, measure, recall_by_distance, recall_curve
 from bikeped.types import Kind

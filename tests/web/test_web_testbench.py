@@ -12,9 +12,9 @@ from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.conformance.latency import sweep
 from bikeped.conformance.montecarlo import Plan, plan_trials, sorted_suite, summaries
-from bikeped.conformance.perception import RecallModel
-from bikeped.conformance.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.decision import Decider
+from bikeped.lab.simulation.perception import RecallModel
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.types import State
 from bikeped.web.testbench_playback import TESTS, coverage, playback
 from bikeped.web.testbench_run import Workbench, trial_summaries

@@ -11,8 +11,8 @@ from testbench_fakes import BASE, LOADED, MARKUP, OWN, SCENARIOS, bench, pages, 
 from web_fakes import PHONE
 
 from bikeped.cli.main import main
-from bikeped.conformance.suite import CONFIGURATIONS, Suite
 from bikeped.lab.scenarios.scenario import load_scenario, parse_scenario
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.web.export import make_report
 
 

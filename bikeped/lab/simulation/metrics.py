@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.conformance.simulate import FPS
-from bikeped.conformance.truth import PEDESTRIAN_PRT_S, Truth
+from bikeped.lab.simulation.simulate import FPS
+from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, Truth
 from bikeped.types import BoolArray, FloatArray, IntArray, State
 
 #: An episode in which a cyclist and a pedestrian came this near is a nuisance, not a false alarm.

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from bikeped.conformance.truth import KIND_OF
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.scenarios.scenario import SIZES_M, Scenario
+from bikeped.lab.simulation.truth import KIND_OF
 from bikeped.types import BoolArray, FloatArray, Kind, KindArray
 
 #: Where the paper's simulation camera stands: world (5, -13), looking north.

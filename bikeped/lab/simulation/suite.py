@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import DecisionConfig, LoadedConfig, ground_camera, rule_settings
-from bikeped.conformance.metrics import Metrics, TruthFrames, measure
-from bikeped.conformance.perception import SIMULATION_POSE, Seen, see
-from bikeped.conformance.simulate import Run, Scene, rows_of, states, track
-from bikeped.conformance.truth import Truth, TruthSettings, judge_truth
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
+from bikeped.lab.simulation.metrics import Metrics, TruthFrames, measure
+from bikeped.lab.simulation.perception import SIMULATION_POSE, Seen, see
+from bikeped.lab.simulation.simulate import Run, Scene, rows_of, states, track
+from bikeped.lab.simulation.truth import Truth, TruthSettings, judge_truth
 
 _SELECTED = DecisionConfig()
 DEFAULT_TRUTH = TruthSettings()
