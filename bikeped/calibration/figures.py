@@ -13,8 +13,8 @@ from bikeped.calibration.fit import Fit
 from bikeped.calibration.initial import FISHEYE
 from bikeped.calibration.model import angles, camera_points
 from bikeped.calibration.write import Field
-from bikeped.conformance.figure_style import BLACK, BLUE, GREY, LIGHT, RED, SERIES, Sheet
 from bikeped.geometry.lens import LIMITS, curve
+from bikeped.lab.plotting import BLACK, BLUE, GREY, LIGHT, RED, SERIES, Sheet
 from bikeped.types import FloatArray
 
 if TYPE_CHECKING:

@@ -123,7 +123,7 @@ def command(
             '"bikeped[calibrate]"'
         ) from error
     if report_path is not None:
-        from bikeped.conformance.figure_style import require_matplotlib
+        from bikeped.lab.plotting import require_matplotlib
 
         require_matplotlib()
     target = out or _DEFAULT_OUT

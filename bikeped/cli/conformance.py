@@ -67,7 +67,7 @@ def run(
 ) -> None:
     """Every scenario under the configuration: states, misses, false alerts, warning budgets."""
     from bikeped.conformance.audit import write_audit
-    from bikeped.conformance.experiments import one_scenario, run_table
+    from bikeped.lab.experiments.deterministic import one_scenario, run_table
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     if name is not None:
@@ -96,7 +96,7 @@ def compare(
     added: tuple[str, ...],
 ) -> None:
     """The named configurations and rules side by side, with and without localisation error."""
-    from bikeped.conformance.experiments import compare_table
+    from bikeped.lab.experiments.deterministic import compare_table
     from bikeped.lab.simulation.suite import CONFIGURATIONS
 
     configurations = dict(CONFIGURATIONS)
@@ -123,7 +123,7 @@ def errors(
     json_path: str | None,
 ) -> None:
     """How far off the camera puts pedestrians, cyclists and cars, by distance and bearing."""
-    from bikeped.conformance.experiments import errors as localisation_errors
+    from bikeped.lab.experiments.deterministic import errors as localisation_errors
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     emit(localisation_errors(suite), suite, loaded, seed or 0, json_path)
@@ -140,8 +140,8 @@ def truth(
     json_path: str | None,
 ) -> None:
     """Do the figures hang on the ground truth's thresholds, or on how cyclists brake?"""
-    from bikeped.conformance.experiments import braking_profiles, truth_sensitivity
-    from bikeped.conformance.tables import Result
+    from bikeped.lab.experiments.deterministic import braking_profiles, truth_sensitivity
+    from bikeped.lab.result_tables import Result
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     decision = loaded.config.decision
@@ -173,7 +173,7 @@ def montecarlo(
 
     The configuration's own decision is `configured` when it is none of the named ones.
     """
-    from bikeped.conformance import montecarlo as mc
+    from bikeped.lab.experiments import montecarlo as mc
     from bikeped.lab.simulation.suite import CONFIGURATIONS
 
     curve = None if curve_path is None else mc.load_recall_curve(curve_path)
@@ -213,8 +213,8 @@ def latency(
     processes: int | None,
 ) -> None:
     """Late pictures, 0 to 500 ms, without prediction and with two kinds of it."""
-    from bikeped.conformance import latency as late
-    from bikeped.conformance import montecarlo as mc
+    from bikeped.lab.experiments import latency as late
+    from bikeped.lab.experiments import montecarlo as mc
 
     if not loss and (bursts or curve_path is not None):
         raise BikepedError("latency: --bursts and --recall-curve belong to --loss; add it")
@@ -299,7 +299,7 @@ def deployment(
     trials: int,
 ) -> None:
     """Road widths with one camera and with two."""
-    from bikeped.conformance import deployment as roads
+    from bikeped.lab.experiments import deployment as roads
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     with progress_bar("road widths", len(roads.WIDTHS_FT)) as progress:
@@ -322,7 +322,7 @@ def placement(
     trials: int,
 ) -> None:
     """Camera height by pitch on a road of 40 ft."""
-    from bikeped.conformance import deployment as roads
+    from bikeped.lab.experiments import deployment as roads
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     with progress_bar("heights", len(roads.HEIGHTS_M)) as progress:
@@ -362,13 +362,13 @@ def reproduce(
 ) -> None:
     """All experiments with every table and figure; resumes where it was interrupted."""
     optimizer()  # says at once when SciPy is not there
-    from bikeped.conformance import reproduce as whole
-    from bikeped.conformance.experiments import shown
-    from bikeped.conformance.montecarlo import load_recall_curve
-    from bikeped.conformance.tables import Table
+    from bikeped.lab.experiments import reproduce as whole
+    from bikeped.lab.experiments.deterministic import shown
+    from bikeped.lab.experiments.montecarlo import load_recall_curve
+    from bikeped.lab.result_tables import Table
 
     if not no_figures:
-        from bikeped.conformance.figure_style import require_matplotlib
+        from bikeped.lab.plotting import require_matplotlib
 
         require_matplotlib()
     curve = None if curve_path is None else load_recall_curve(curve_path)

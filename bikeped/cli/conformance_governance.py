@@ -261,9 +261,9 @@ def plot(
     json_path: str | None,
 ) -> int:
     """Draw each scenario: a strip over time and a plan from above."""
-    from bikeped.conformance.figure_style import require_matplotlib
-    from bikeped.conformance.plan import draw_plan
-    from bikeped.conformance.strip import draw_strip
+    from bikeped.lab.experiments.scenario_plan import draw_plan
+    from bikeped.lab.experiments.strip_chart import draw_strip
+    from bikeped.lab.plotting import require_matplotlib
 
     require_matplotlib()
     loaded = load_config(config_path, overrides)

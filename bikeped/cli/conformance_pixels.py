@@ -63,7 +63,7 @@ def command(
     """
     from dataclasses import replace
 
-    from bikeped.conformance.experiments import one_scenario
+    from bikeped.lab.experiments.deterministic import one_scenario
     from bikeped.pixels.ladder import ladder
     from bikeped.pixels.measures import sights
     from bikeped.pixels.report import Drawing, pixels_result, verdict
@@ -72,7 +72,7 @@ def command(
 
     width, height = _size(size)
     if figures is not None:
-        from bikeped.conformance.figure_style import require_matplotlib
+        from bikeped.lab.plotting import require_matplotlib
 
         require_matplotlib()
         make_folder(figures, "--figures")

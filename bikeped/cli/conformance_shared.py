@@ -16,7 +16,7 @@ from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
-    from bikeped.conformance.tables import Cell, Result, Table
+    from bikeped.lab.result_tables import Cell, Result, Table
     from bikeped.lab.simulation.suite import Suite
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -149,7 +149,7 @@ def emit(
 
 def stamp(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
     """What every JSON begins with: where its figures come from."""
-    from bikeped.conformance.experiments import provenance
+    from bikeped.lab.experiments.deterministic import provenance
 
     return provenance(suite, loaded, seed)
 
@@ -157,7 +157,7 @@ def stamp(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
 def optimizer() -> Any:
     """The optimiser's module; BikepedError where the extra that it needs is not installed."""
     try:
-        from bikeped.conformance import optimizer
+        from bikeped.lab.experiments import optimizer
     except ImportError as error:
         raise BikepedError(
             f"{error.name}: not installed; install bikeped[sim] for the optimiser"

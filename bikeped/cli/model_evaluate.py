@@ -21,7 +21,7 @@ from bikeped.config import load_config
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
-    from bikeped.conformance.tables import Cell, Table
+    from bikeped.lab.result_tables import Cell, Table
     from bikeped.training.evaluate import Evaluation
     from bikeped.training.measures import Row
 
@@ -101,7 +101,7 @@ def command(
     from bikeped.training.evaluate import EvaluationSettings, evaluate, load_models, write_curve
 
     if figure is not None:
-        from bikeped.conformance.figure_style import require_matplotlib
+        from bikeped.lab.plotting import require_matplotlib
 
         require_matplotlib()
         if figure.suffix != ".png":
@@ -148,7 +148,7 @@ def command(
 
 def tables(result: Evaluation) -> list[Table]:
     """The paper's detection table, by size, and by class where there is more than one."""
-    from bikeped.conformance.tables import Table
+    from bikeped.lab.result_tables import Table
     from bikeped.training.evaluation_figures import evaluation_rows
 
     rows = [evaluation_rows(score) for score in result.scores]
@@ -184,7 +184,7 @@ def tables(result: Evaluation) -> list[Table]:
 
 def _alarms(result: Evaluation) -> Table:
     """False alarms of what is deployed."""
-    from bikeped.conformance.tables import Table
+    from bikeped.lab.result_tables import Table
     from bikeped.training.evaluate import KIND_NAMES
 
     pictures = result.data["images"]
@@ -201,7 +201,7 @@ def _alarms(result: Evaluation) -> Table:
 
 def _distances(result: Evaluation) -> Table:
     """Recall against distance, where the data tell it."""
-    from bikeped.conformance.tables import Table
+    from bikeped.lab.result_tables import Table
 
     first = result.scores[0].by_distance
     lines: list[tuple[Cell, ...]] = []

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bikeped.conformance.figure_style import GREY, SERIES, Sheet, percents, reals
+from bikeped.lab.plotting import GREY, SERIES, Sheet, percents, reals
 from bikeped.types import Kind
 
 

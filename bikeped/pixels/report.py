@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bikeped.conformance.experiments import SHOWN_COLUMNS, percent, shown
-from bikeped.conformance.tables import Cell, Result, Table
+from bikeped.lab.experiments.deterministic import SHOWN_COLUMNS, percent, shown
+from bikeped.lab.result_tables import Cell, Result, Table
 from bikeped.lab.simulation.metrics import Metrics, number
 from bikeped.lab.simulation.perception import error_table
 from bikeped.lab.simulation.suite import Suite

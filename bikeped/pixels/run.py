@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import LoadedConfig
-from bikeped.conformance.workers import workers
 from bikeped.feedback import SignalLogic
+from bikeped.lab.process_pool import workers
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.pixels.drawn import DrawnSource

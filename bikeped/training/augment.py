@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped import __version__
-from bikeped.conformance.workers import workers
 from bikeped.errors import DataSetError
+from bikeped.lab.process_pool import workers
 from bikeped.training.coco import (
     CocoData,
     CocoImage,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bikeped.conformance.figure_style import SERIES, Sheet, plain, reals
+from bikeped.lab.plotting import SERIES, Sheet, plain, reals
 from bikeped.training.evaluate import Evaluation, Scores
 from bikeped.training.measures import Row
 

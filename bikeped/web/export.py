@@ -21,15 +21,15 @@ import msgspec
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
-from bikeped.conformance.experiments import compare_table, run_table
-from bikeped.conformance.report import (
+from bikeped.lab.experiments.deterministic import compare_table, run_table
+from bikeped.lab.experiments.report import (
     definitions_html,
     risks_html,
     table_html,
     tested_html,
     verdict_html,
 )
-from bikeped.conformance.tables import Result
+from bikeped.lab.result_tables import Result
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.web.testbench import configurations
 from bikeped.web.testbench_contest import runs

@@ -22,7 +22,7 @@ from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, code_hash
 from bikeped.config.section import Section
-from bikeped.conformance.optimizer import BOUNDS
+from bikeped.lab.experiments.optimizer import BOUNDS
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.web.server import Page, add_page, json_answer, json_body

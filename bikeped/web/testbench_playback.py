@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.conformance.experiments import onsets
 from bikeped.decision import PairVerdicts, chosen_pair, explain, pair_numbers, remembered
 from bikeped.geometry import CameraPose, GroundCamera
+from bikeped.lab.experiments.deterministic import onsets
 from bikeped.lab.simulation.metrics import measure, number
 from bikeped.lab.simulation.simulate import FPS, verdicts
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, Truth

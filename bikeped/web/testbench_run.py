@@ -18,10 +18,10 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from bikeped.config import LoadedConfig
-from bikeped.conformance.deployment import fuse
-from bikeped.conformance.montecarlo import Observed, Plan, simulate_trials, summaries
 from bikeped.errors import BikepedError
 from bikeped.geometry import CameraPose
+from bikeped.lab.experiments.deployment import fuse
+from bikeped.lab.experiments.montecarlo import Observed, Plan, simulate_trials, summaries
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
 from bikeped.lab.simulation.metrics import TruthFrames
 from bikeped.lab.simulation.perception import RecallModel, Seen, see

@@ -19,9 +19,9 @@ from msgspec import Meta
 
 from bikeped.config import CameraConfig, DecisionConfig, LoadedConfig, ground_camera
 from bikeped.config.section import Section
-from bikeped.conformance.latency import delay_frames
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.geometry import CameraPose, GroundCamera
+from bikeped.lab.experiments.latency import delay_frames
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
 from bikeped.lab.simulation.perception import SIMULATION_POSE, RecallModel
 from bikeped.lab.simulation.truth import TruthSettings

@@ -64,9 +64,9 @@ def _searches(figures: Figures, suite: Suite, loaded: LoadedConfig, one_pass_s: 
 
     It is not run for half an hour: one pass was measured, the rest is arithmetic.
     """
-    from bikeped.conformance import optimizer
-    from bikeped.conformance.reproduce import Settings, reproduce
     from bikeped.cores import cores
+    from bikeped.lab.experiments import optimizer
+    from bikeped.lab.experiments.reproduce import Settings, reproduce
 
     count = optimizer.evaluations()
     began = time.perf_counter()

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from bikeped.config import load_config
-from bikeped.conformance import reproduce as rep
-from bikeped.conformance.tables import Result
 from bikeped.errors import BikepedError
+from bikeped.lab.experiments import reproduce as rep
+from bikeped.lab.result_tables import Result
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
 

@@ -13,10 +13,10 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.config.candidate import parse_decision
-from bikeped.conformance import deployment as dep
-from bikeped.conformance import experiments as ex
-from bikeped.conformance import optimizer as opt
 from bikeped.errors import ScenarioError
+from bikeped.lab.experiments import deployment as dep
+from bikeped.lab.experiments import deterministic as ex
+from bikeped.lab.experiments import optimizer as opt
 from bikeped.lab.scenarios.scenario import SIZES_M, bundled_folder, load_scenarios
 from bikeped.lab.simulation.perception import RecallModel, localise, see
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite

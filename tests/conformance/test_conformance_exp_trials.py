@@ -11,9 +11,15 @@ import numpy as np
 import pytest
 
 from bikeped.config import load_config, rule_settings
-from bikeped.conformance import montecarlo as mc
-from bikeped.conformance.latency import DELAYS_MS, PREDICTORS, delay_frames, sweep, sweep_with_loss
 from bikeped.errors import BikepedError
+from bikeped.lab.experiments import montecarlo as mc
+from bikeped.lab.experiments.latency import (
+    DELAYS_MS,
+    PREDICTORS,
+    delay_frames,
+    sweep,
+    sweep_with_loss,
+)
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.metrics import measure
 from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator

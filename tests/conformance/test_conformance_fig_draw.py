@@ -9,11 +9,11 @@ import pytest
 
 from bikeped.cli import conformance_governance as governance
 from bikeped.config import DecisionConfig, load_config
-from bikeped.conformance.figure_style import Sheet, stem_of
-from bikeped.conformance.figures import FIGURES, draw_all
-from bikeped.conformance.plan import draw_plan
-from bikeped.conformance.strip import draw_strip, onsets, spans
 from bikeped.errors import BikepedError
+from bikeped.lab.experiments.figures import FIGURES, draw_all
+from bikeped.lab.experiments.scenario_plan import draw_plan
+from bikeped.lab.experiments.strip_chart import draw_strip, onsets, spans
+from bikeped.lab.plotting import Sheet, stem_of
 from bikeped.lab.scenarios.scenario import parse_scenario
 from bikeped.lab.simulation.suite import Suite
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from bikeped.conformance.report import write_index
-from bikeped.conformance.tables import Result, Table
 from bikeped.errors import BikepedError
+from bikeped.lab.experiments.report import write_index
+from bikeped.lab.result_tables import Result, Table
 
 EVIL = '<script>alert("x")</script> & $1$'
 VOID = {"meta", "img", "br", "link", "hr"}

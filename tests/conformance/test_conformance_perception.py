@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bikeped.conformance.montecarlo import Observed
+from bikeped.lab.experiments.montecarlo import Observed
 from bikeped.lab.simulation.perception import (
     AVERAGE_PRECISION,
     OVERALL_RECALL,

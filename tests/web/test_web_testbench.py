@@ -10,9 +10,9 @@ from aiohttp.test_utils import TestClient, TestServer
 from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.conformance.latency import sweep
-from bikeped.conformance.montecarlo import Plan, plan_trials, sorted_suite, summaries
 from bikeped.decision import Decider
+from bikeped.lab.experiments.latency import sweep
+from bikeped.lab.experiments.montecarlo import Plan, plan_trials, sorted_suite, summaries
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.types import State

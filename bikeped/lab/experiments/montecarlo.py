@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.conformance.experiments import Progress, percent, quiet
-from bikeped.conformance.tables import Result, Table
-from bikeped.conformance.workers import workers
 from bikeped.errors import BikepedError
+from bikeped.lab.experiments.deterministic import Progress, percent, quiet
+from bikeped.lab.process_pool import workers
+from bikeped.lab.result_tables import Result, Table
 from bikeped.lab.simulation.metrics import Metrics, TruthFrames, measure
 from bikeped.lab.simulation.perception import RecallMode, RecallModel, Seen, lost, trial_generator
 from bikeped.lab.simulation.simulate import Scene, Tracked, delayed, rows_of, states, track

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.conformance.figure_style import (
+from bikeped.lab.plotting import (
     BLACK,
     BLUE,
     GREY,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.conformance import figure_areas, figure_lines
-from bikeped.conformance.figure_style import require_matplotlib
 from bikeped.errors import BikepedError
+from bikeped.lab.experiments import figure_areas, figure_lines
+from bikeped.lab.plotting import require_matplotlib
 from bikeped.lab.simulation.suite import Suite
 
 Draw = Callable[[Mapping[str, Any], str, str, Path], list[Path]]

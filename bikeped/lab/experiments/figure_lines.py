@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bikeped.conformance.figure_style import (
+from bikeped.conformance.gates import SENSITIVITY_MIN, SPECIFICITY_MIN
+from bikeped.lab.plotting import (
     BLACK,
     BLUE,
     GREEN,
@@ -21,7 +22,6 @@ from bikeped.conformance.figure_style import (
     plain,
     reals,
 )
-from bikeped.conformance.gates import SENSITIVITY_MIN, SPECIFICITY_MIN
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
 from bikeped.types import FloatArray
 

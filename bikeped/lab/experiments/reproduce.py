@@ -21,11 +21,12 @@ import numpy as np
 
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
-from bikeped.conformance import deployment, experiments, latency, montecarlo, optimizer
-from bikeped.conformance.experiments import Progress, provenance, quiet
-from bikeped.conformance.tables import Result, Table
-from bikeped.conformance.workers import workers
 from bikeped.files import make_folder, write_whole
+from bikeped.lab.experiments import deployment, latency, montecarlo, optimizer
+from bikeped.lab.experiments import deterministic as experiments
+from bikeped.lab.experiments.deterministic import Progress, provenance, quiet
+from bikeped.lab.process_pool import workers
+from bikeped.lab.result_tables import Result, Table
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 
@@ -175,7 +176,7 @@ def compute(
 
 def draw(result: Result, suite: Suite, folder: Path) -> list[Path]:
     """The figures of one experiment: the job of a process too."""
-    from bikeped.conformance.figures import draw_all
+    from bikeped.lab.experiments.figures import draw_all
 
     return draw_all({result.name: result.data}, suite, folder)
 
@@ -269,7 +270,7 @@ def reproduce(
     drawn = tuple(path for name in SHOWN_ORDER for path in pictures.get(name, []))
     index: Path | None = None
     if figures:
-        from bikeped.conformance.report import write_index
+        from bikeped.lab.experiments.report import write_index
 
         said = {
             "version": str(stamp["version"]),

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 
 from bikeped.config import DecisionConfig
-from bikeped.conformance.experiments import Progress, percent, quiet
-from bikeped.conformance.montecarlo import Observed, Plan, simulate_views, summaries
-from bikeped.conformance.tables import Result, Table
 from bikeped.geometry import CameraPose, GroundCamera, Lens
+from bikeped.lab.experiments.deterministic import Progress, percent, quiet
+from bikeped.lab.experiments.montecarlo import Observed, Plan, simulate_views, summaries
+from bikeped.lab.result_tables import Result, Table
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.metrics import TruthFrames
 from bikeped.lab.simulation.perception import RecallModel, Seen, see

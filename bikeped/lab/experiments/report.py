@@ -13,11 +13,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
-from bikeped.conformance.figures import FIGURES
 from bikeped.conformance.gates import all_hold, check_figures
 from bikeped.conformance.register import from_figures
-from bikeped.conformance.tables import Cell, Result, Table
 from bikeped.files import write_whole
+from bikeped.lab.experiments.figures import FIGURES
+from bikeped.lab.result_tables import Cell, Result, Table
 
 #: Without the table of scenarios, the verdict is on the comparison's first of these.
 _JUDGED = ("deployed", "selected")

@@ -17,9 +17,9 @@ import scipy
 from scipy.optimize import Bounds, differential_evolution
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.conformance.experiments import SHOWN_COLUMNS, Progress, quiet, shown
-from bikeped.conformance.tables import Result, Table
 from bikeped.errors import ScenarioError
+from bikeped.lab.experiments.deterministic import SHOWN_COLUMNS, Progress, quiet, shown
+from bikeped.lab.result_tables import Result, Table
 from bikeped.lab.simulation.metrics import Metrics, measure
 from bikeped.lab.simulation.simulate import states
 from bikeped.lab.simulation.suite import Suite

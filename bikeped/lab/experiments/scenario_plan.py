@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.config import DecisionConfig
-from bikeped.conformance.figure_style import (
+from bikeped.lab.experiments.strip_chart import onsets
+from bikeped.lab.plotting import (
     BLACK,
     BLUE,
     GREEN,
@@ -21,7 +22,6 @@ from bikeped.conformance.figure_style import (
     plain,
     stem_of,
 )
-from bikeped.conformance.strip import onsets
 from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.lab.simulation.suite import Suite
 from bikeped.types import FloatArray

@@ -16,8 +16,8 @@ import numpy as np
 
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
-from bikeped.conformance.tables import Cell, Result, Table
 from bikeped.errors import ScenarioError
+from bikeped.lab.result_tables import Cell, Result, Table
 from bikeped.lab.scenarios.scenario import SIZES_M
 from bikeped.lab.simulation.metrics import Metrics, measure, number
 from bikeped.lab.simulation.perception import error_table, localise

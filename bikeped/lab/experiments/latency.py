@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bikeped.config import DecisionConfig
-from bikeped.conformance.experiments import Progress, percent, quiet, seconds
-from bikeped.conformance.montecarlo import (
+from bikeped.lab.experiments.deterministic import Progress, percent, quiet, seconds
+from bikeped.lab.experiments.montecarlo import (
     TRIALS,
     Plan,
     measure_lanes,
@@ -18,7 +18,7 @@ from bikeped.conformance.montecarlo import (
     sorted_suite,
     summaries,
 )
-from bikeped.conformance.tables import Result, Table
+from bikeped.lab.result_tables import Result, Table
 from bikeped.lab.simulation.metrics import TruthFrames
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.simulate import FPS, track

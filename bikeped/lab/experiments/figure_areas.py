@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.conformance.figure_style import (
+from bikeped.lab.plotting import (
     BLACK,
     BLUE,
     GREEN,
