@@ -66,8 +66,8 @@ def run(
     audit_path: Path | None,
 ) -> None:
     """Every scenario under the configuration: states, misses, false alerts, warning budgets."""
-    from bikeped.conformance.audit import write_audit
     from bikeped.lab.experiments.deterministic import one_scenario, run_table
+    from bikeped.lab.governance.audit_records import write_audit
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     if name is not None:

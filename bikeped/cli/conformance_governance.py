@@ -56,7 +56,7 @@ def gate(
     a gate does not hold.
     """
     from bikeped.config.provenance import decision_hash
-    from bikeped.conformance.gates import all_hold, check
+    from bikeped.lab.governance.gates import all_hold, check
 
     rest, own = _split(overrides)
     decision = load_decision(candidate, own)
@@ -108,9 +108,9 @@ def promote(
     FILE.provenance.json, which `bikeped run` checks. A candidate that fails a gate is refused:
     nothing is written, the command ends with 1.
     """
-    from bikeped.conformance.gates import all_hold, check
-    from bikeped.conformance.promote import promote as write
-    from bikeped.conformance.promote import provenance_record
+    from bikeped.lab.governance.gates import all_hold, check
+    from bikeped.lab.governance.promote import promote as write
+    from bikeped.lab.governance.promote import provenance_record
 
     rest, own = _split(overrides)
     if rest:
@@ -180,7 +180,7 @@ def contest(
     Before is the configuration as it is (-c) on the suite as it is; after is with --set, --bound,
     --truth and --scenario. Needs no camera, no model and no access to the pole.
     """
-    from bikeped.conformance import contest as contesting
+    from bikeped.lab.governance import contest as contesting
     from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.lab.simulation.suite import DEFAULT_TRUTH
 
@@ -227,7 +227,7 @@ def register(
     json_path: str | None,
 ) -> int:
     """Write the residual-risk register of the configuration's decision."""
-    from bikeped.conformance.register import build
+    from bikeped.lab.governance.register import build
 
     loaded = load_config(config_path, overrides)
     found = build(load_suite(loaded, scenarios_dir), loaded.config.decision)

@@ -10,7 +10,7 @@ from rich.table import Table as RichTable
 from bikeped.cli.common import console
 
 if TYPE_CHECKING:
-    from bikeped.conformance.gates import Gate
+    from bikeped.lab.governance.gates import Gate
 
 
 def count(scenarios: int) -> str:

@@ -18,8 +18,8 @@ import numpy as np
 from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
-from bikeped.conformance.contest import Contest, Side, contest
-from bikeped.conformance.gates import check
+from bikeped.lab.governance.contest import Contest, Side, contest
+from bikeped.lab.governance.gates import check
 from bikeped.web.testbench_run import Workbench
 from bikeped.web.testbench_settings import VIEW, Bench, file_of, in_force, link_of
 

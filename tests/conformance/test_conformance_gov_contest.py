@@ -9,10 +9,10 @@ import pytest
 
 from bikeped.cli import conformance_governance as governance
 from bikeped.config import DecisionConfig, load_config
-from bikeped.conformance import register
-from bikeped.conformance.audit import write_audit
-from bikeped.conformance.contest import apply_bounds, contest, parse_truth, with_scenarios
 from bikeped.errors import BikepedError
+from bikeped.lab.governance import register
+from bikeped.lab.governance.audit_records import write_audit
+from bikeped.lab.governance.contest import apply_bounds, contest, parse_truth, with_scenarios
 from bikeped.lab.scenarios.scenario import parse_scenario
 from bikeped.lab.simulation.suite import DEFAULT_TRUTH, Suite
 from bikeped.types import State

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bikeped.conformance.gates import SENSITIVITY_MIN, SPECIFICITY_MIN
+from bikeped.lab.governance.gates import SENSITIVITY_MIN, SPECIFICITY_MIN
 from bikeped.lab.plotting import (
     BLACK,
     BLUE,

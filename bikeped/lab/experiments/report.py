@@ -13,10 +13,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
-from bikeped.conformance.gates import all_hold, check_figures
-from bikeped.conformance.register import from_figures
 from bikeped.files import write_whole
 from bikeped.lab.experiments.figures import FIGURES
+from bikeped.lab.governance.gates import all_hold, check_figures
+from bikeped.lab.governance.register import from_figures
 from bikeped.lab.result_tables import Cell, Result, Table
 
 #: Without the table of scenarios, the verdict is on the comparison's first of these.

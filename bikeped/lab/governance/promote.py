@@ -22,9 +22,9 @@ from bikeped.config.provenance import (
     decision_hash,
     provenance_path,
 )
-from bikeped.conformance.gates import check
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.files import write_like
+from bikeped.lab.governance.gates import check
 from bikeped.lab.simulation.metrics import Metrics
 from bikeped.lab.simulation.suite import Suite, camera_json
 

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from bikeped.config import DecisionConfig
 from bikeped.config.provenance import decision_hash
-from bikeped.conformance.gates import all_hold, check
 from bikeped.errors import BikepedError, ScenarioError
+from bikeped.lab.governance.gates import all_hold, check
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
 from bikeped.lab.simulation.metrics import Metrics, number
 from bikeped.lab.simulation.suite import Suite

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bikeped.config import DecisionConfig
-from bikeped.conformance.gates import BUDGET_ABOVE_S, SENSITIVITY_MIN, SPECIFICITY_MIN
+from bikeped.lab.governance.gates import BUDGET_ABOVE_S, SENSITIVITY_MIN, SPECIFICITY_MIN
 from bikeped.lab.result_tables import Cell, Table
 from bikeped.lab.simulation.suite import Suite
 from bikeped.types import State

@@ -1,1 +1,0 @@
-"""The conformance simulation: scripted hazards through the deployed tracker and rules."""
