@@ -31,8 +31,8 @@ from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
 from bikeped.files import make_folder, write_whole
+from bikeped.lab.rendering.random_scene import USUAL_MIX
 from bikeped.models import BUNDLED_FILE
-from bikeped.scene.chance import USUAL_MIX
 from bikeped.training.augment import AugmentSettings, augment_data
 from bikeped.training.card import (
     DrawnTest,

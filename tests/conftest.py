@@ -20,7 +20,7 @@ import pytest
 import simplejpeg
 from onnx import TensorProto, helper, numpy_helper
 
-from bikeped.scene.avi import AviWriter
+from bikeped.lab.rendering.avi_writer import AviWriter
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
 DEADLINE_S = 30.0  # generous: reached only by a failure

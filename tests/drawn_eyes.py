@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bikeped.detection.base import DetectorAnswer
-from bikeped.scene import DrawnObject
-from bikeped.scene.clip import read_sidecar
+from bikeped.lab.rendering import DrawnObject
+from bikeped.lab.rendering.clip import read_sidecar
 from bikeped.service.vision import Picture
 from bikeped.types import Detections
 

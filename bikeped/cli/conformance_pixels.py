@@ -64,11 +64,11 @@ def command(
     from dataclasses import replace
 
     from bikeped.lab.experiments.deterministic import one_scenario
+    from bikeped.lab.rendering import Conditions
     from bikeped.pixels.ladder import ladder
     from bikeped.pixels.measures import sights
     from bikeped.pixels.report import Drawing, pixels_result, verdict
     from bikeped.pixels.run import run_all
-    from bikeped.scene import Conditions
 
     width, height = _size(size)
     if figures is not None:

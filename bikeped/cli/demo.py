@@ -54,10 +54,10 @@ def command(
     Without a configured detector the bundled one looks at the pictures.
     """
     from bikeped.demo import bundled_scenario, format_summary, summarise
+    from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera, sidecar_path
+    from bikeped.lab.rendering.clip import frame_times, write_clip
     from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.models import BUNDLED, NOT_FOR_STREETS
-    from bikeped.scene import Conditions, ScenePainter, scene_camera, sidecar_path
-    from bikeped.scene.clip import frame_times, write_clip
     from bikeped.service.replay import ReplayFiles, replay
     from bikeped.telemetry.http import port_error
 

@@ -25,8 +25,8 @@ from bikeped.errors import BikepedError, GeometryError, ScenarioError
 from bikeped.files import write_whole
 
 if TYPE_CHECKING:
+    from bikeped.lab.rendering import DrawnObject, SceneCamera, ScenePainter
     from bikeped.lab.scenarios.scenario import Scenario
-    from bikeped.scene import DrawnObject, SceneCamera, ScenePainter
     from bikeped.types import ImageArray
 
 _LIGHTS = ("day", "overcast", "dusk", "night", "glare")
@@ -103,7 +103,7 @@ def command(
     json_path: str | None,
 ) -> None:
     """Draw SCENARIO (a file, or the name of a bundled one) as the configured camera sees it."""
-    from bikeped.scene import Conditions, ScenePainter, sidecar_path
+    from bikeped.lab.rendering import Conditions, ScenePainter, sidecar_path
 
     loaded = load_config(config_path, overrides)
     wide_high = _size(size)
@@ -151,8 +151,8 @@ def command(
 def _clip(
     painter: ScenePainter, out: Path, fps: int, quality: int, seconds: float | None
 ) -> dict[str, Any]:
-    from bikeped.scene import read_sidecar, write_clip
-    from bikeped.scene.clip import frame_times
+    from bikeped.lab.rendering import read_sidecar, write_clip
+    from bikeped.lab.rendering.clip import frame_times
 
     times = frame_times(painter, fps, seconds)
     with progress_bar("drawing", len(times)) as tell:
@@ -231,7 +231,7 @@ def _mark(image: ImageArray, objects: list[DrawnObject]) -> None:
 def _dataset(
     loaded: LoadedConfig, out: Path, count: int, seed: int, size: tuple[int, int], lens: str
 ) -> dict[str, Any]:
-    from bikeped.scene import write_dataset
+    from bikeped.lab.rendering import write_dataset
 
     camera = _camera(loaded, size) if lens == "configured" else None
     with progress_bar("drawing", count) as tell:
@@ -256,7 +256,7 @@ def _dataset(
 
 def _camera(loaded: LoadedConfig, size: tuple[int, int]) -> SceneCamera:
     """The configured camera for pictures of `size`, which must have the sensor's proportions."""
-    from bikeped.scene import scene_camera
+    from bikeped.lab.rendering import scene_camera
 
     try:
         return scene_camera(loaded, size)

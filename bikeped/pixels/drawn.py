@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import simplejpeg
 
 from bikeped.capture.base import FrameSource
-from bikeped.scene import DrawnObject, ScenePainter
+from bikeped.lab.rendering import DrawnObject, ScenePainter
 from bikeped.types import Frame
 
 #: Of the pole's camera, roughly: what its compression does to small figures belongs to the chain.

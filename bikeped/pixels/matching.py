@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.scene import DrawnObject
+from bikeped.lab.rendering import DrawnObject
 from bikeped.types import Detections, FloatArray, IntArray
 
 #: Least overlap (intersection over union) of a detection with the object that it is.

@@ -22,8 +22,8 @@ from bikeped.config import LoadedConfig
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import Detector, load_detector
 from bikeped.geometry import road_region
-from bikeped.scene import Conditions, DrawnObject, SceneCamera, pictures, scene_camera
-from bikeped.scene.clip import encode_jpeg
+from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, pictures, scene_camera
+from bikeped.lab.rendering.clip import encode_jpeg
 from bikeped.types import Detections, FloatArray, Kind, Region
 
 #: Bounds of the distance rings, metres along the ground from below the lens.

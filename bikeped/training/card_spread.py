@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.scene.dataset import PICTURES_A_STREET
+from bikeped.lab.rendering.dataset import PICTURES_A_STREET
 from bikeped.training.card import NEAR_M, Sight
 from bikeped.types import FloatArray, Kind
 

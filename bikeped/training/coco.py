@@ -176,7 +176,7 @@ def read_coco(data: Path, images_dir: Path | None = None) -> CocoData:
 def furniture(image: CocoImage) -> list[tuple[str, Box]]:
     """What stands in a drawn picture and is nobody, and its box within the picture.
 
-    bikeped's own addition to an image's entry (`bikeped.scene`): `furniture`, a list of `what` and
+    bikeped's own addition to an image's entry (`bikeped.lab.rendering`): `furniture`, a list of `what` and
     `bbox`, which may reach beyond the picture. Raises DataSetError where it is no such list.
     """
     found: list[tuple[str, Box]] = []

@@ -2,7 +2,7 @@
 
 Nine parts in ten are seen by the configured camera, moved and turned a little; the others through
 fisheye lenses, heights and pitches of every kind. Street, place, light, weather, clothes and who is
-about follow from the seeds of `bikeped.scene`.
+about follow from the seeds of `bikeped.lab.rendering`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import DataSetError
 from bikeped.files import make_folder
 from bikeped.geometry import CameraPose
-from bikeped.scene import DEFAULT_POSE, Mix, SceneCamera, scene_camera, write_dataset
+from bikeped.lab.rendering import DEFAULT_POSE, Mix, SceneCamera, scene_camera, write_dataset
 from bikeped.training.coco import write_annotations
 
 #: Seeds of parts begin here, so that no set shares a street with another: training from
@@ -97,7 +97,7 @@ def draw_set(
 def part_camera(
     settings: DrawnSettings, number: int, loaded: LoadedConfig
 ) -> tuple[SceneCamera | None, tuple[int, int]]:
-    """The camera of a part (None: one of `bikeped.scene`'s own for every street) and the size."""
+    """The camera of a part (None: one of `bikeped.lab.rendering`'s own for every street) and the size."""
     random = np.random.default_rng([settings.seed, number, 7])
     size = _LARGE if random.random() < settings.large else _SMALL
     if random.random() >= settings.configured:

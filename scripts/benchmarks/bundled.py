@@ -18,11 +18,11 @@ FRAMES, DISTINCT = 240, 24
 def run(figures: Figures) -> None:
     """Frames a second on this machine's cores, recording on disk to decision."""
     from bikeped.config import load_config
+    from bikeped.lab.rendering import ScenePainter, scene_camera
+    from bikeped.lab.rendering.avi_writer import AviWriter
+    from bikeped.lab.rendering.clip import encode_jpeg
     from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
     from bikeped.models import BUNDLED_FILE
-    from bikeped.scene import ScenePainter, scene_camera
-    from bikeped.scene.avi import AviWriter
-    from bikeped.scene.clip import encode_jpeg
     from bikeped.service.replay import replay
 
     # As `bikeped replay` has it: two copies of the model share the cores.

@@ -23,7 +23,7 @@ def run(figures: Figures) -> None:
         return
     from benchmarks.pictures import street_4k
     from bikeped.config import load_config
-    from bikeped.scene.avi import AviWriter
+    from bikeped.lab.rendering.avi_writer import AviWriter
     from bikeped.service.replay import replay
 
     pictures = street_4k(DISTINCT)

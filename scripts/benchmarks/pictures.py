@@ -10,9 +10,9 @@ def street_4k(count: int) -> list[bytes]:
     """`count` frames of the demo's crossing at 3840 x 2160, spread over its length."""
     from bikeped.config import load_config
     from bikeped.demo import bundled_scenario
+    from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
+    from bikeped.lab.rendering.clip import encode_jpeg
     from bikeped.lab.scenarios.scenario import load_scenario
-    from bikeped.scene import Conditions, ScenePainter, scene_camera
-    from bikeped.scene.clip import encode_jpeg
 
     scenario = load_scenario(bundled_scenario())
     painter = ScenePainter(scenario, scene_camera(load_config(), (3840, 2160)), Conditions())

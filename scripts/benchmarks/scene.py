@@ -6,10 +6,16 @@ import cv2
 
 from benchmarks.figures import Figures, in_turns
 from bikeped.config import load_config
+from bikeped.lab.rendering import (
+    Conditions,
+    SceneCamera,
+    ScenePainter,
+    random_scenario,
+    scene_camera,
+)
+from bikeped.lab.rendering.backdrop import backdrop
+from bikeped.lab.rendering.render_camera import rays
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
-from bikeped.scene import Conditions, SceneCamera, ScenePainter, random_scenario, scene_camera
-from bikeped.scene.backdrop import backdrop
-from bikeped.scene.camera import rays
 
 _FRAMES = 8
 

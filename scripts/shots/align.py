@@ -19,8 +19,8 @@ import numpy as np
 from bikeped.config import framing, ground_camera, load_config
 from bikeped.demo import bundled_scenario
 from bikeped.geometry import CameraPose
+from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter
 from bikeped.lab.scenarios.scenario import load_scenario
-from bikeped.scene import Conditions, SceneCamera, ScenePainter
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

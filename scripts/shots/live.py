@@ -14,9 +14,9 @@ import numpy as np
 
 from bikeped.config import LoadedConfig, load_config
 from bikeped.detection.base import DetectorAnswer
+from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
+from bikeped.lab.rendering.clip import read_sidecar, sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import parse_scenario
-from bikeped.scene import Conditions, ScenePainter, scene_camera
-from bikeped.scene.clip import read_sidecar, sidecar_path, write_clip
 from bikeped.service.replay import replay
 from bikeped.types import Detections
 from bikeped.web.service import ServicePages

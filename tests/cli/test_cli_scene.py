@@ -10,8 +10,8 @@ import cv2
 import pytest
 
 from bikeped.cli.main import main
+from bikeped.lab.rendering import read_sidecar, sidecar_path
 from bikeped.lab.scenarios.scenario import bundled_folder
-from bikeped.scene import read_sidecar, sidecar_path
 
 SMALL = ("--size", "320x180")
 

@@ -6,8 +6,8 @@ from drawn_eyes import boxes
 
 from bikeped.config import load_config
 from bikeped.demo import bundled_scenario, format_summary, summarise
+from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import load_scenario
-from bikeped.scene import Conditions, ScenePainter, scene_camera
 from bikeped.service.judge import Judge
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"

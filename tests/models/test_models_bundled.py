@@ -12,6 +12,7 @@ from bikeped.config import load_config, road_region
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
+from bikeped.lab.rendering import ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.models import (
     BUNDLED,
@@ -20,7 +21,6 @@ from bikeped.models import (
     NOT_FOR_STREETS,
     model_file,
 )
-from bikeped.scene import ScenePainter, scene_camera
 from bikeped.service.doctor import check_model
 from bikeped.training.card_text import reached
 from bikeped.types import Kind

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bikeped.scene import DrawnObject
+from bikeped.lab.rendering import DrawnObject
 from bikeped.types import Detections, Kind
 
 

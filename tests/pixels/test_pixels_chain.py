@@ -9,6 +9,7 @@ import pytest
 from drawn_eyes import OracleEye
 
 from bikeped.config import LoadedConfig, load_config
+from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
 from bikeped.lab.simulation.truth import judge_truth
@@ -17,7 +18,6 @@ from bikeped.pixels.matching import MIN_VISIBLE
 from bikeped.pixels.measures import localisation_rows, recall_rows, sights
 from bikeped.pixels.report import Drawing, pixels_result, verdict
 from bikeped.pixels.run import PixelRun, run_scenario
-from bikeped.scene import Conditions, ScenePainter, scene_camera
 from bikeped.types import Detections, Kind
 
 SIZE = (960, 540)

@@ -12,8 +12,7 @@ import pytest
 from bikeped.capture import VideoSource
 from bikeped.config import load_config
 from bikeped.errors import BikepedError, CaptureError
-from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
-from bikeped.scene import (
+from bikeped.lab.rendering import (
     Conditions,
     ScenePainter,
     read_sidecar,
@@ -22,6 +21,7 @@ from bikeped.scene import (
     write_clip,
     write_dataset,
 )
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.types import Kind
 
 SIZE = (320, 180)

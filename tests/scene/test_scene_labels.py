@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from bikeped.config import load_config
 from bikeped.geometry import GroundCamera
+from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, ScenePainter, scene_camera
+from bikeped.lab.rendering.conditions import lighting
+from bikeped.lab.rendering.people import Looks, person
+from bikeped.lab.rendering.sprite import rasterise
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
-from bikeped.scene import Conditions, DrawnObject, SceneCamera, ScenePainter, scene_camera
-from bikeped.scene.conditions import lighting
-from bikeped.scene.people import Looks, person
-from bikeped.scene.sprite import rasterise
 from bikeped.types import FloatArray, Kind
 
 SIZE = (640, 360)

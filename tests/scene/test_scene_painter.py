@@ -12,8 +12,7 @@ import pytest
 from bikeped.config import load_config
 from bikeped.errors import GeometryError, ScenarioError
 from bikeped.geometry import Lens
-from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenario
-from bikeped.scene import (
+from bikeped.lab.rendering import (
     LIGHTS,
     Conditions,
     Mix,
@@ -26,11 +25,12 @@ from bikeped.scene import (
     rectilinear_camera,
     scene_camera,
 )
-from bikeped.scene.backdrop import backdrop
-from bikeped.scene.camera import rays
-from bikeped.scene.paste import paste
-from bikeped.scene.place import place
-from bikeped.scene.sprite import Sprite
+from bikeped.lab.rendering.backdrop import backdrop
+from bikeped.lab.rendering.compositing import paste
+from bikeped.lab.rendering.render_camera import rays
+from bikeped.lab.rendering.sprite import Sprite
+from bikeped.lab.rendering.street_layout import place
+from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenario
 from bikeped.types import ImageArray
 
 SIZE = (320, 180)

@@ -9,8 +9,8 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.config.sections import DetectionConfig
+from bikeped.lab.rendering import DrawnObject, scene_camera
 from bikeped.models import BUNDLED_FILE
-from bikeped.scene import DrawnObject, scene_camera
 from bikeped.training.card import (
     DrawnTest,
     Sight,

@@ -15,8 +15,8 @@ from bikeped.config.sections import DetectionConfig
 from bikeped.detection.facts import ModelMetadata
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DataSetError, DetectorError
+from bikeped.lab.rendering.dataset import write_dataset
 from bikeped.lab.simulation.perception import AREA_SCALE
-from bikeped.scene.dataset import write_dataset
 from bikeped.training.coco import read_coco
 from bikeped.training.evaluate import (
     EvaluationSettings,
@@ -201,7 +201,7 @@ def test_models_are_told_apart(tmp_path):
 
 
 def test_drawn_scenes_are_read_and_judged_by_distance(tmp_path):
-    """Data of `bikeped.scene`: a network that answers the truth finds everything, near and far."""
+    """Data of `bikeped.lab.rendering`: a network that answers the truth finds everything, near and far."""
     data = read_coco(write_dataset(tmp_path / "scenes", 4, 1, size=(480, 270)))
     assert list(data.categories.values()) == ["pedestrian", "cyclist", "vehicle"]
     scale, top = 320 / 480, (320 - 180) // 2

@@ -18,9 +18,9 @@ from playwright.sync_api import Page, expect
 from web_fakes import DESKTOP, OPEN, PHONE, SIGNALS, Scene, inside, small
 
 from bikeped.config import load_config
+from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
+from bikeped.lab.rendering.clip import sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
-from bikeped.scene import Conditions, ScenePainter, scene_camera
-from bikeped.scene.clip import sidecar_path, write_clip
 from bikeped.service.replay import ReplayFiles, ReplayResult, replay
 from bikeped.telemetry.messages import parse_event
 from bikeped.web.live import Live, add_live

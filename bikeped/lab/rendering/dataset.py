@@ -14,12 +14,12 @@ import numpy as np
 
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder
-from bikeped.scene.camera import SceneCamera
-from bikeped.scene.chance import USUAL_MIX, Mix, random_camera, random_scenario
-from bikeped.scene.clip import encode_jpeg
-from bikeped.scene.conditions import Conditions, random_conditions
-from bikeped.scene.labels import DrawnObject
-from bikeped.scene.painter import Box, ScenePainter
+from bikeped.lab.rendering.clip import encode_jpeg
+from bikeped.lab.rendering.conditions import Conditions, random_conditions
+from bikeped.lab.rendering.labels import DrawnObject
+from bikeped.lab.rendering.painter import Box, ScenePainter
+from bikeped.lab.rendering.random_scene import USUAL_MIX, Mix, random_camera, random_scenario
+from bikeped.lab.rendering.render_camera import SceneCamera
 from bikeped.types import ImageArray, Kind
 
 CATEGORIES = [{"id": kind.value + 1, "name": kind.label} for kind in Kind]

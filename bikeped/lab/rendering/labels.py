@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.geometry import CameraPose
-from bikeped.scene.sprite import Sprite, inside, touch
+from bikeped.lab.rendering.sprite import Sprite, inside, touch
 from bikeped.types import BoolArray, Float32Array, FloatArray, Kind
 
 #: What each kind of agent counts as: the default configuration's classes.

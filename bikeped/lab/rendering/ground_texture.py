@@ -8,8 +8,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from bikeped.scene.mesh import Rgb
-from bikeped.scene.place import Place
+from bikeped.lab.rendering.mesh import Rgb
+from bikeped.lab.rendering.street_layout import Place
 from bikeped.types import Float32Array, ImageArray
 
 _WHITE: Rgb = (228, 229, 224)

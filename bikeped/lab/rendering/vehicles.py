@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bikeped.scene.mesh import Builder, Mesh, Rgb
-from bikeped.scene.people import RUBBER
+from bikeped.lab.rendering.mesh import Builder, Mesh, Rgb
+from bikeped.lab.rendering.people import RUBBER
 
 PAINTS: tuple[Rgb, ...] = (
     (196, 198, 200), (232, 232, 230), (38, 40, 44), (98, 102, 108), (140, 32, 34), (34, 62, 112),

@@ -8,13 +8,13 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from bikeped.scene.camera import Rays, SceneCamera, rays
-from bikeped.scene.conditions import Conditions, Lighting, lighting
-from bikeped.scene.furniture import LAMP_HEAD_M, fixture, house
-from bikeped.scene.ground import GroundMap, ground_map, noise_tile
-from bikeped.scene.mesh import Mesh, normals
-from bikeped.scene.place import Fixture, Place, place
-from bikeped.scene.sprite import Sprite, rasterise, shaded
+from bikeped.lab.rendering.conditions import Conditions, Lighting, lighting
+from bikeped.lab.rendering.furniture import LAMP_HEAD_M, fixture, house
+from bikeped.lab.rendering.ground_texture import GroundMap, ground_map, noise_tile
+from bikeped.lab.rendering.mesh import Mesh, normals
+from bikeped.lab.rendering.render_camera import Rays, SceneCamera, rays
+from bikeped.lab.rendering.sprite import Sprite, rasterise, shaded
+from bikeped.lab.rendering.street_layout import Fixture, Place, place
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
 
 _SHIFT = 4

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bikeped.scene.camera import SceneCamera
-from bikeped.scene.conditions import Lighting
-from bikeped.scene.mesh import Mesh, normals
+from bikeped.lab.rendering.conditions import Lighting
+from bikeped.lab.rendering.mesh import Mesh, normals
+from bikeped.lab.rendering.render_camera import SceneCamera
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
 
 _SHIFT = 5

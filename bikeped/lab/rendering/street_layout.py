@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.scene.mesh import Rgb
+from bikeped.lab.rendering.mesh import Rgb
 
 CROSSING_X_M = 5.0
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from bikeped.scene.camera import (
+from bikeped.lab.rendering.clip import ClipTruth, read_sidecar, sidecar_path, write_clip
+from bikeped.lab.rendering.conditions import LIGHTS, WEATHERS, Conditions, random_conditions
+from bikeped.lab.rendering.dataset import pictures, write_dataset
+from bikeped.lab.rendering.labels import KINDS, DrawnObject
+from bikeped.lab.rendering.painter import ScenePainter
+from bikeped.lab.rendering.random_scene import Mix, random_camera, random_scenario
+from bikeped.lab.rendering.render_camera import (
     DEFAULT_POSE,
     SceneCamera,
     lens_camera,
     rectilinear_camera,
     scene_camera,
 )
-from bikeped.scene.chance import Mix, random_camera, random_scenario
-from bikeped.scene.clip import ClipTruth, read_sidecar, sidecar_path, write_clip
-from bikeped.scene.conditions import LIGHTS, WEATHERS, Conditions, random_conditions
-from bikeped.scene.dataset import pictures, write_dataset
-from bikeped.scene.labels import KINDS, DrawnObject
-from bikeped.scene.painter import ScenePainter
 
 __all__ = [
     "DEFAULT_POSE",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.scene.mesh import Builder, Mesh, Point, Rgb
+from bikeped.lab.rendering.mesh import Builder, Mesh, Point, Rgb
 
 SKINS: tuple[Rgb, ...] = (
     (236, 196, 170), (224, 178, 148), (198, 148, 114), (160, 112, 82), (118, 80, 60), (84, 58, 46),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from bikeped.scene.mesh import Builder, Mesh, Point, Rgb
-from bikeped.scene.people import RUBBER, Looks, head
+from bikeped.lab.rendering.mesh import Builder, Mesh, Point, Rgb
+from bikeped.lab.rendering.people import RUBBER, Looks, head
 
 #: A cyclist agent shorter than this stands on an e-scooter.
 SCOOTER_MAX_LENGTH_M = 1.5

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from bikeped.lab.rendering.backdrop import Standing, backdrop
+from bikeped.lab.rendering.compositing import darken, footprint, paste, shine
+from bikeped.lab.rendering.conditions import Conditions
+from bikeped.lab.rendering.furniture import FEET_M, POLE_FOOT_M
+from bikeped.lab.rendering.labels import Candidate, DrawnObject, label
+from bikeped.lab.rendering.mesh import Mesh
+from bikeped.lab.rendering.people import Looks, person
+from bikeped.lab.rendering.render_camera import SceneCamera
+from bikeped.lab.rendering.riders import rider
+from bikeped.lab.rendering.sprite import Sprite, rasterise, shadow, touch
+from bikeped.lab.rendering.vehicles import vehicle
+from bikeped.lab.rendering.weather import Weather
 from bikeped.lab.scenarios.scenario import Agent, Scenario
-from bikeped.scene.backdrop import Standing, backdrop
-from bikeped.scene.camera import SceneCamera
-from bikeped.scene.conditions import Conditions
-from bikeped.scene.furniture import FEET_M, POLE_FOOT_M
-from bikeped.scene.labels import Candidate, DrawnObject, label
-from bikeped.scene.mesh import Mesh
-from bikeped.scene.paste import darken, footprint, paste, shine
-from bikeped.scene.people import Looks, person
-from bikeped.scene.riders import rider
-from bikeped.scene.sprite import Sprite, rasterise, shadow, touch
-from bikeped.scene.vehicles import vehicle
-from bikeped.scene.weather import Weather
 from bikeped.types import FloatArray, ImageArray
 
 _PATH_CLEAR_M = 1.1  #: fixtures nearer than this to somebody's path are left out

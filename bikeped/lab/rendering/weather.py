@@ -8,7 +8,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from bikeped.scene.backdrop import Backdrop
+from bikeped.lab.rendering.backdrop import Backdrop
 from bikeped.types import ImageArray
 
 _TILE = 512

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from bikeped.scene.backdrop import Backdrop
-from bikeped.scene.camera import SceneCamera
-from bikeped.scene.mesh import Lamp
-from bikeped.scene.sprite import Sprite, inside
+from bikeped.lab.rendering.backdrop import Backdrop
+from bikeped.lab.rendering.mesh import Lamp
+from bikeped.lab.rendering.render_camera import SceneCamera
+from bikeped.lab.rendering.sprite import Sprite, inside
 from bikeped.types import Float32Array, FloatArray, ImageArray
 
 _EVEN = 0.04  #: vignettes that differ by less within a sprite are taken as one

@@ -13,9 +13,9 @@ import simplejpeg
 
 from bikeped.errors import CaptureError
 from bikeped.files import write_whole
-from bikeped.scene.avi import AviWriter
-from bikeped.scene.labels import DrawnObject
-from bikeped.scene.painter import ScenePainter
+from bikeped.lab.rendering.avi_writer import AviWriter
+from bikeped.lab.rendering.labels import DrawnObject
+from bikeped.lab.rendering.painter import ScenePainter
 from bikeped.types import ImageArray, Kind
 
 FORMAT = "bikeped drawn boxes 2"

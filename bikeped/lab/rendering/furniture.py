@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from bikeped.lab.rendering.mesh import Builder, Mesh, Point, Rgb
+from bikeped.lab.rendering.street_layout import Fixture, House
+from bikeped.lab.rendering.vehicles import vehicle
 from bikeped.lab.scenarios.scenario import SIZES_M
-from bikeped.scene.mesh import Builder, Mesh, Point, Rgb
-from bikeped.scene.place import Fixture, House
-from bikeped.scene.vehicles import vehicle
 
 _STEEL: Rgb = (96, 100, 106)
 LAMP_HEAD_M = (1.6, 5.9)  #: how far over the road and how high a street lamp shines

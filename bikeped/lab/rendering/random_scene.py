@@ -9,8 +9,13 @@ import numpy as np
 
 from bikeped.errors import GeometryError
 from bikeped.geometry import CameraPose, Lens
+from bikeped.lab.rendering.render_camera import (
+    DEFAULT_POSE,
+    SceneCamera,
+    lens_camera,
+    rectilinear_camera,
+)
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
-from bikeped.scene.camera import DEFAULT_POSE, SceneCamera, lens_camera, rectilinear_camera
 
 _DURATION_S = 6.0
 _NEAREST_M, _FARTHEST_M = 1.5, 40.0
