@@ -63,12 +63,12 @@ def command(
     """
     from dataclasses import replace
 
+    from bikeped.lab.endtoend.ablation import ladder
+    from bikeped.lab.endtoend.measures import sights
+    from bikeped.lab.endtoend.report import Drawing, pixels_result, verdict
+    from bikeped.lab.endtoend.run import run_all
     from bikeped.lab.experiments.deterministic import one_scenario
     from bikeped.lab.rendering import Conditions
-    from bikeped.pixels.ladder import ladder
-    from bikeped.pixels.measures import sights
-    from bikeped.pixels.report import Drawing, pixels_result, verdict
-    from bikeped.pixels.run import run_all
 
     width, height = _size(size)
     if figures is not None:
@@ -96,7 +96,7 @@ def command(
     drawing = Drawing(width, height, light, weather, place, seed or 0)
     result = pixels_result(suite, runs, rungs, sights(runs, suite.seen, loaded), drawing)
     if figures is not None:
-        from bikeped.pixels.figure import draw_pixels
+        from bikeped.lab.endtoend.figure import draw_pixels
 
         draw_pixels(result.data, figures)
     emit(result, suite, loaded, seed or 0, json_path)

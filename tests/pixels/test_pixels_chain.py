@@ -9,15 +9,15 @@ import pytest
 from drawn_eyes import OracleEye
 
 from bikeped.config import LoadedConfig, load_config
+from bikeped.lab.endtoend.ablation import ladder
+from bikeped.lab.endtoend.matching import MIN_VISIBLE
+from bikeped.lab.endtoend.measures import localisation_rows, recall_rows, sights
+from bikeped.lab.endtoend.report import Drawing, pixels_result, verdict
+from bikeped.lab.endtoend.run import PixelRun, run_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
 from bikeped.lab.simulation.truth import judge_truth
-from bikeped.pixels.ladder import ladder
-from bikeped.pixels.matching import MIN_VISIBLE
-from bikeped.pixels.measures import localisation_rows, recall_rows, sights
-from bikeped.pixels.report import Drawing, pixels_result, verdict
-from bikeped.pixels.run import PixelRun, run_scenario
 from bikeped.types import Detections, Kind
 
 SIZE = (960, 540)
@@ -77,7 +77,7 @@ def test_the_loop_and_the_ladder_decide_alike(
     run: PixelRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
     """The last rung comes out of the loop, the others out of its judge: same boxes, same states."""
-    from bikeped.pixels.ladder import _judge_boxes
+    from bikeped.lab.endtoend.ablation import _judge_boxes
     from bikeped.service.judge import Judge
 
     judge = Judge(loaded, riders_whole=run.riders_whole)

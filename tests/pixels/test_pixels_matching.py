@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pixels_fakes import drawn, found
 
-from bikeped.pixels.matching import iou, match
+from bikeped.lab.endtoend.matching import iou, match
 from bikeped.types import Detections, Kind
 
 WALKER, RIDER = Kind.PEDESTRIAN, Kind.CYCLIST

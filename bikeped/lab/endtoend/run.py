@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from bikeped.config import LoadedConfig
 from bikeped.feedback import SignalLogic
+from bikeped.lab.endtoend.drawn_source import DrawnSource
 from bikeped.lab.process_pool import workers
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
-from bikeped.pixels.drawn import DrawnSource
 from bikeped.service.announcer import Announcer
 from bikeped.service.feed import RecordedFeed
 from bikeped.service.judge import Judge

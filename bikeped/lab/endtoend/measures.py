@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 
 from bikeped.config import LoadedConfig
+from bikeped.lab.endtoend.matching import MIN_VISIBLE, match
+from bikeped.lab.endtoend.run import PixelRun
 from bikeped.lab.simulation.perception import Seen
-from bikeped.pixels.matching import MIN_VISIBLE, match
-from bikeped.pixels.run import PixelRun
 from bikeped.service.viewpoint import Viewpoint
 from bikeped.types import Detections, FloatArray, Kind
 

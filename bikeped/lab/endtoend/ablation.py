@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.lab.endtoend.matching import MIN_VISIBLE, match
+from bikeped.lab.endtoend.run import PixelRun
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.simulation.metrics import Metrics, measure
 from bikeped.lab.simulation.perception import Seen
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.suite import Suite
-from bikeped.pixels.matching import MIN_VISIBLE, match
-from bikeped.pixels.run import PixelRun
 from bikeped.service.judge import Judge
 from bikeped.types import Detections, GroundPoints
 

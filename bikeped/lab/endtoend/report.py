@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from bikeped.lab.endtoend.ablation import Rung
+from bikeped.lab.endtoend.matching import MIN_IOU, MIN_VISIBLE
+from bikeped.lab.endtoend.measures import Sights, localisation_rows, recall_rows
+from bikeped.lab.endtoend.run import PixelRun
 from bikeped.lab.experiments.deterministic import SHOWN_COLUMNS, percent, shown
 from bikeped.lab.result_tables import Cell, Result, Table
 from bikeped.lab.simulation.metrics import Metrics, number
 from bikeped.lab.simulation.perception import error_table
 from bikeped.lab.simulation.suite import Suite
-from bikeped.pixels.ladder import Rung
-from bikeped.pixels.matching import MIN_IOU, MIN_VISIBLE
-from bikeped.pixels.measures import Sights, localisation_rows, recall_rows
-from bikeped.pixels.run import PixelRun
 from bikeped.types import Kind
 
 #: Sensitivity and specificity from pixels may lie this far from the scripted run's, in share.
