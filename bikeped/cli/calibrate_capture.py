@@ -9,14 +9,14 @@ import click
 from rich.console import Console
 from rich.markup import escape
 
-from bikeped.calibration.board_pdf import write_board_pdf
-from bikeped.calibration.live import Guide
-from bikeped.calibration.live_page import LivePage
-from bikeped.calibration.live_session import LiveSession, assumed_lens, capture_boards
-from bikeped.calibration.views import BoardPattern
 from bikeped.capture import open_source
 from bikeped.cli.calibrate_run import camera_config
 from bikeped.errors import BikepedError
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.capture.board_pdf import write_board_pdf
+from bikeped.lab.calibration.capture.guide import Guide
+from bikeped.lab.calibration.capture.live_page import LivePage
+from bikeped.lab.calibration.capture.live_session import LiveSession, assumed_lens, capture_boards
 
 DEFAULT_FOLDER = Path("calibration-pictures")
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from bikeped.calibration.views import BoardPattern
 from bikeped.errors import BikepedError
+from bikeped.lab.calibration.board_view import BoardPattern
 
 #: A board needs corners in two directions, and no printed one has more.
 _FEWEST, _MOST = 3, 60

@@ -9,29 +9,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.calibration.circle import brightest, circle_radius_px
-from bikeped.calibration.compare import (
-    Calibrated,
-    Recommendation,
-    calibrate,
-    models_to_compare,
-    recommend,
-)
-from bikeped.calibration.corners import find_boards
-from bikeped.calibration.coverage import Coverage, cover
-from bikeped.calibration.fit import Fit
-from bikeped.calibration.model import Model
-from bikeped.calibration.pictures import Picture, load_pictures
-from bikeped.calibration.prepare import cropped, prepare
-from bikeped.calibration.results import cautions_of, result_data
-from bikeped.calibration.views import BoardPattern, Found
-from bikeped.calibration.write import Field, calibration_data, field_of_view, write_calibration
 from bikeped.cli.calibrate_options import Asked
 from bikeped.cli.common import progress_bar, write_json
 from bikeped.config import LoadedConfig, framing, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 from bikeped.geometry import Framing, canonical_projection
+from bikeped.lab.calibration.board_view import BoardPattern, Found
+from bikeped.lab.calibration.capture.coverage import Coverage, cover
+from bikeped.lab.calibration.capture.pictures import Picture, load_pictures
+from bikeped.lab.calibration.corners.find_boards import find_boards
+from bikeped.lab.calibration.report.calibration_file import (
+    Field,
+    calibration_data,
+    field_of_view,
+    write_calibration,
+)
+from bikeped.lab.calibration.report.results import cautions_of, result_data
+from bikeped.lab.calibration.solver.compare import (
+    Calibrated,
+    Recommendation,
+    calibrate,
+    models_to_compare,
+    recommend,
+)
+from bikeped.lab.calibration.solver.image_circle import brightest, circle_radius_px
+from bikeped.lab.calibration.solver.lens_fit import Fit
+from bikeped.lab.calibration.solver.lens_model import Model
+from bikeped.lab.calibration.solver.observations import cropped, prepare
 
 _CIRCLE_PICTURES = 16
 
@@ -82,8 +87,8 @@ class Done:
         return lines
 
     def _page(self) -> str:
-        from bikeped.calibration.report import Told, report_page
-        from bikeped.calibration.report_pictures import Thumbnail
+        from bikeped.lab.calibration.report.board_images import Thumbnail
+        from bikeped.lab.calibration.report.html_report import Told, report_page
 
         offset = (0, 0) if self.framing is None else self.framing.offset_px
         told = Told(

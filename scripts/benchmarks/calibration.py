@@ -12,18 +12,18 @@ import numpy as np
 
 if TYPE_CHECKING:
     from benchmarks.figures import Figures
-    from bikeped.calibration.model import Model, Sightings, State
-    from bikeped.calibration.views import BoardView
+    from bikeped.lab.calibration.board_view import BoardView
+    from bikeped.lab.calibration.solver.lens_model import Model, Sightings, State
 
 _PICTURES = Path(__file__).parents[3] / "shared" / "media" / "fisheye-checkerboard"
 _RUNS = 3
 
 
 def run(figures: Figures) -> None:
-    from bikeped.calibration.adjust import adjust
-    from bikeped.calibration.initial import first_guess
-    from bikeped.calibration.model import Model, Sightings
-    from bikeped.calibration.views import BoardPattern
+    from bikeped.lab.calibration.board_view import BoardPattern
+    from bikeped.lab.calibration.solver.bundle_adjustment import adjust
+    from bikeped.lab.calibration.solver.initial_guess import first_guess
+    from bikeped.lab.calibration.solver.lens_model import Model, Sightings
 
     pattern = BoardPattern(8, 6)
     model = Model("equidistant", 4)
@@ -41,9 +41,9 @@ def run(figures: Figures) -> None:
 
 
 def _boards(count: int, size: int, fov_deg: float) -> list[BoardView]:
-    from bikeped.calibration.synthetic import DrawnCamera, draw_views, spread_poses
-    from bikeped.calibration.views import BoardPattern
     from bikeped.geometry import Lens
+    from bikeped.lab.calibration.board_view import BoardPattern
+    from bikeped.lab.calibration.synthetic import DrawnCamera, draw_views, spread_poses
 
     pattern = BoardPattern(8, 6)
     lens = Lens.from_circle("equidistant", size / 2, fov_deg, (0.003, -0.008, 0.002, -0.0004))
@@ -55,7 +55,12 @@ def _dense(sightings: Sightings, start: State) -> None:
     """The obvious way: all parameters in one vector, numeric Jacobian, the same two stages."""
     from scipy.optimize import least_squares
 
-    from bikeped.calibration.model import State, residuals, rotation_vectors, rotations
+    from bikeped.lab.calibration.solver.lens_model import (
+        State,
+        residuals,
+        rotation_vectors,
+        rotations,
+    )
 
     views = len(sightings)
     first = np.concatenate(
@@ -80,12 +85,12 @@ def large(figures: Figures) -> None:
     """42 drawn pictures of 3500 x 3500 through a 200 degree lens; drawing them takes a minute."""
     import cv2
 
-    from bikeped.calibration.compare import models_to_compare
-    from bikeped.calibration.model import Model
-    from bikeped.calibration.render import Look, draw_picture
-    from bikeped.calibration.synthetic import DrawnCamera, spread_poses
-    from bikeped.calibration.views import BoardPattern
     from bikeped.geometry import Lens
+    from bikeped.lab.calibration.board_render import Look, draw_picture
+    from bikeped.lab.calibration.board_view import BoardPattern
+    from bikeped.lab.calibration.solver.compare import models_to_compare
+    from bikeped.lab.calibration.solver.lens_model import Model
+    from bikeped.lab.calibration.synthetic import DrawnCamera, spread_poses
 
     pattern = BoardPattern(8, 6)
     lens = Lens.from_circle("equidistant", 1750, 200.0)
@@ -103,11 +108,11 @@ def large(figures: Figures) -> None:
 
 def _work(paths: list[Path], models: list[Model]) -> Callable[[], object]:
     """Pictures to recommendation, in this process: what `bikeped calibrate` does after start-up."""
-    from bikeped.calibration.compare import calibrate, recommend
-    from bikeped.calibration.corners import find_boards
-    from bikeped.calibration.pictures import load_pictures
-    from bikeped.calibration.prepare import prepare
-    from bikeped.calibration.views import BoardPattern
+    from bikeped.lab.calibration.board_view import BoardPattern
+    from bikeped.lab.calibration.capture.pictures import load_pictures
+    from bikeped.lab.calibration.corners.find_boards import find_boards
+    from bikeped.lab.calibration.solver.compare import calibrate, recommend
+    from bikeped.lab.calibration.solver.observations import prepare
 
     def work() -> object:
         found = find_boards(load_pictures(paths), BoardPattern(8, 6))
@@ -117,8 +122,8 @@ def _work(paths: list[Path], models: list[Model]) -> Callable[[], object]:
 
 
 def _whole(figures: Figures) -> None:
-    from bikeped.calibration.compare import models_to_compare
-    from bikeped.calibration.model import Model
+    from bikeped.lab.calibration.solver.compare import models_to_compare
+    from bikeped.lab.calibration.solver.lens_model import Model
 
     files = sorted(_PICTURES.glob("*.jpg"))
     if files:

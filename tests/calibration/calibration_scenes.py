@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from bikeped.calibration.synthetic import BoardBend, DrawnCamera, draw_views, spread_poses
-from bikeped.calibration.views import BoardPattern, BoardView, Found, Refused
 from bikeped.geometry import Lens
 from bikeped.geometry.lens import Projection
+from bikeped.lab.calibration.board_view import BoardPattern, BoardView, Found, Refused
+from bikeped.lab.calibration.synthetic import BoardBend, DrawnCamera, draw_views, spread_poses
 
 PATTERN = BoardPattern(8, 6, 0.1)
 FLAT = BoardBend()

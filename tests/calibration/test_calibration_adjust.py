@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from calibration_scenes import PATTERN, boards, camera, found
 
-from bikeped.calibration import adjust as adjust_module
-from bikeped.calibration import validate as validate_module
-from bikeped.calibration.adjust import Stage, adjust, minimise
-from bikeped.calibration.board_shape import gauge_basis
-from bikeped.calibration.compare import start_for
-from bikeped.calibration.fit import fit
-from bikeped.calibration.initial import first_guess, picture_errors_px
-from bikeped.calibration.model import Model, Sightings, residuals
-from bikeped.calibration.prepare import prepare
-from bikeped.calibration.synthetic import BoardBend, DrawnCamera
-from bikeped.calibration.validate import fit_poses, folds_of, held_out_residuals
-from bikeped.calibration.views import BoardView
 from bikeped.geometry import GroundCamera, Lens
 from bikeped.geometry.lens import Projection
+from bikeped.lab.calibration.board_view import BoardView
+from bikeped.lab.calibration.solver import bundle_adjustment as adjust_module
+from bikeped.lab.calibration.solver import cross_validation as validate_module
+from bikeped.lab.calibration.solver.board_shape import gauge_basis
+from bikeped.lab.calibration.solver.bundle_adjustment import Stage, adjust, minimise
+from bikeped.lab.calibration.solver.compare import start_for
+from bikeped.lab.calibration.solver.cross_validation import fit_poses, folds_of, held_out_residuals
+from bikeped.lab.calibration.solver.initial_guess import first_guess, picture_errors_px
+from bikeped.lab.calibration.solver.lens_fit import fit
+from bikeped.lab.calibration.solver.lens_model import Model, Sightings, residuals
+from bikeped.lab.calibration.solver.observations import prepare
+from bikeped.lab.calibration.synthetic import BoardBend, DrawnCamera
 
 HEIGHT_M = 3.6576
 K = (0.004, -0.008, 0.002, -0.0003)

@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.calibration.jacobian import jacobian
-from bikeped.calibration.model import (
+from bikeped.geometry import Lens
+from bikeped.geometry.lens import Projection
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.solver.jacobian import jacobian
+from bikeped.lab.calibration.solver.lens_model import (
     PLAIN,
     State,
     camera_points,
@@ -18,10 +21,7 @@ from bikeped.calibration.model import (
     rotation_vectors,
     rotations,
 )
-from bikeped.calibration.normal import Step, moved, normal_equations
-from bikeped.calibration.views import BoardPattern
-from bikeped.geometry import Lens
-from bikeped.geometry.lens import Projection
+from bikeped.lab.calibration.solver.normal_equations import Step, moved, normal_equations
 
 PATTERN = BoardPattern(4, 3)
 FLAT = PATTERN.corners_m()

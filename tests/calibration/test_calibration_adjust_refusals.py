@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from calibration_scenes import PATTERN, boards, camera, found
 
-from bikeped.calibration.compare import calibrate
-from bikeped.calibration.model import Model
-from bikeped.calibration.prepare import cropped, prepare
-from bikeped.calibration.synthetic import (
+from bikeped.errors import CalibrationError
+from bikeped.geometry import Framing, Lens
+from bikeped.lab.calibration.board_view import BoardView, Refused
+from bikeped.lab.calibration.solver.compare import calibrate
+from bikeped.lab.calibration.solver.lens_model import Model
+from bikeped.lab.calibration.solver.observations import cropped, prepare
+from bikeped.lab.calibration.synthetic import (
     BoardPose,
     DrawnCamera,
     draw_views,
     spread_poses,
     turn,
 )
-from bikeped.calibration.views import BoardView, Refused
-from bikeped.errors import CalibrationError
-from bikeped.geometry import Framing, Lens
 
 
 def refusal(views: list[BoardView], refused: tuple[Refused, ...] = ()) -> str:

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.calibration.board_pdf import PAGES, board_pdf, write_board_pdf
-from bikeped.calibration.views import BoardPattern
 from bikeped.errors import BikepedError, CalibrationError
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.capture.board_pdf import PAGES, board_pdf, write_board_pdf
 from bikeped.types import FloatArray
 
 POINT_MM = 25.4 / 72

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from calibration_scenes import boards, camera, found
 
-from bikeped.calibration.compare import (
+from bikeped.geometry.lens import Projection, curve
+from bikeped.lab.calibration.report.calibration_file import field_of_view
+from bikeped.lab.calibration.report.results import result_data
+from bikeped.lab.calibration.solver.compare import (
     Calibrated,
     calibrate,
     models_to_compare,
@@ -17,14 +20,11 @@ from bikeped.calibration.compare import (
     recommend,
     start_for,
 )
-from bikeped.calibration.fit import Fit
-from bikeped.calibration.initial import FISHEYE
-from bikeped.calibration.model import Model, angles, camera_points
-from bikeped.calibration.prepare import prepare
-from bikeped.calibration.results import result_data
-from bikeped.calibration.synthetic import BoardBend
-from bikeped.calibration.write import field_of_view
-from bikeped.geometry.lens import Projection, curve
+from bikeped.lab.calibration.solver.initial_guess import FISHEYE
+from bikeped.lab.calibration.solver.lens_fit import Fit
+from bikeped.lab.calibration.solver.lens_model import Model, angles, camera_points
+from bikeped.lab.calibration.solver.observations import prepare
+from bikeped.lab.calibration.synthetic import BoardBend
 
 WINDOW = (0.0, 0.0, 1000.0, 1000.0)
 

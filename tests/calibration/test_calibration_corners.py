@@ -10,20 +10,20 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.calibration.corners import find_board, find_boards, suggest_pattern
-from bikeped.calibration.pictures import Picture, load_pictures
-from bikeped.calibration.refine import refine
-from bikeped.calibration.render import Look, draw_picture
-from bikeped.calibration.synthetic import (
+from bikeped.errors import CalibrationError
+from bikeped.geometry import Lens
+from bikeped.lab.calibration.board_render import Look, draw_picture
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.capture.pictures import Picture, load_pictures
+from bikeped.lab.calibration.corners.find_boards import find_board, find_boards, suggest_pattern
+from bikeped.lab.calibration.corners.refine import refine
+from bikeped.lab.calibration.synthetic import (
     BoardPose,
     DrawnCamera,
     spread_poses,
     true_corners,
     turn,
 )
-from bikeped.calibration.views import BoardPattern
-from bikeped.errors import CalibrationError
-from bikeped.geometry import Lens
 from bikeped.types import FloatArray, ImageArray
 
 PATTERN = BoardPattern(8, 6, 0.04)
@@ -160,7 +160,8 @@ def test_a_corner_that_the_detector_misplaced_is_put_right(monkeypatch: pytest.M
     claimed = truth.copy()
     claimed[[9, 20]] += [[14.0, -9.0], [-10.0, 10.0]]
     monkeypatch.setattr(
-        "bikeped.calibration.corners.raw_candidates", lambda grey, pattern: iter([claimed])
+        "bikeped.lab.calibration.corners.find_boards.raw_candidates",
+        lambda grey, pattern: iter([claimed]),
     )
     seen = find_board(picture, PATTERN)
     assert seen.board is not None, seen.why
@@ -175,7 +176,7 @@ def test_a_corner_that_cannot_be_seen_is_left_out() -> None:
     hidden = int(np.argmin(np.abs(truth - truth.mean(0)).sum(1)))
     u, v = truth[hidden]
     cv2.circle(picture, (round(float(u)), round(float(v))), 9, 130, -1)
-    from bikeped.calibration.check import Checked, check_board
+    from bikeped.lab.calibration.corners.board_check import Checked, check_board
 
     checked = check_board(picture, PATTERN, truth)
     assert isinstance(checked, Checked)
@@ -188,7 +189,7 @@ def test_a_corner_that_cannot_be_seen_is_left_out() -> None:
 def test_random_corners_make_no_board() -> None:
     rng = np.random.default_rng(4)
     picture = rng.integers(0, 255, (480, 640)).astype(np.uint8)
-    from bikeped.calibration.check import check_board
+    from bikeped.lab.calibration.corners.board_check import check_board
 
     assert isinstance(check_board(picture, PATTERN, rng.uniform(50, 400, (48, 2))), str)
     grid = np.stack([*np.meshgrid(np.arange(8) * 30.0 + 50, np.arange(6) * 30.0 + 50)], -1)
@@ -199,7 +200,7 @@ def test_a_smaller_pattern_than_the_board_is_refused() -> None:
     pose = BoardPose(np.eye(3), np.array([0.0, 0.0, 0.3]))
     picture = draw_picture(camera(), PATTERN, pose)
     truth = true_corners(camera(), PATTERN, pose)[0].reshape(6, 8, 2)
-    from bikeped.calibration.check import check_board
+    from bikeped.lab.calibration.corners.board_check import check_board
 
     for part, pattern in (
         (truth[:, :7], BoardPattern(7, 6)),

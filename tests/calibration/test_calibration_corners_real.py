@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from shared_inputs import SHARED
 
-from bikeped.calibration.corners import find_board, find_boards
-from bikeped.calibration.pictures import load_pictures
-from bikeped.calibration.views import BoardPattern, Found
+from bikeped.lab.calibration.board_view import BoardPattern, Found
+from bikeped.lab.calibration.capture.pictures import load_pictures
+from bikeped.lab.calibration.corners.find_boards import find_board, find_boards
 
 PATTERN = BoardPattern(8, 6)
 FOLDER = SHARED / "media" / "fisheye-checkerboard"

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from bikeped.calibration import detect_remapped
-from bikeped.calibration.corners import find_board
-from bikeped.calibration.detect_raw import at_scale
-from bikeped.calibration.detect_remapped import GAZES, Gaze, positions
-from bikeped.calibration.render import draw_picture
-from bikeped.calibration.synthetic import BoardPose, DrawnCamera, true_corners
-from bikeped.calibration.views import BoardPattern
 from bikeped.geometry import Lens
+from bikeped.lab.calibration.board_render import draw_picture
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.corners import detect_remapped
+from bikeped.lab.calibration.corners.detect_raw import at_scale
+from bikeped.lab.calibration.corners.detect_remapped import GAZES, Gaze, positions
+from bikeped.lab.calibration.corners.find_boards import find_board
+from bikeped.lab.calibration.synthetic import BoardPose, DrawnCamera, true_corners
 from bikeped.types import FloatArray, ImageArray
 
 PATTERN = BoardPattern(8, 6, 0.04)
@@ -46,7 +46,7 @@ def test_boards_are_found_when_the_picture_itself_gives_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        "bikeped.calibration.corners.raw_candidates", lambda grey, pattern: iter(())
+        "bikeped.lab.calibration.corners.find_boards.raw_candidates", lambda grey, pattern: iter(())
     )
     for pose in (
         BoardPose(np.eye(3), np.array([0.0, 0.0, 0.13])),  # close: it fills the view

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.calibration.grow import grids
-from bikeped.calibration.render import Look, draw_picture
-from bikeped.calibration.synthetic import DrawnCamera, spread_poses, true_corners
-from bikeped.calibration.views import BoardPattern
 from bikeped.geometry import Lens
+from bikeped.lab.calibration.board_render import Look, draw_picture
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.corners.grid_growing import grids
+from bikeped.lab.calibration.synthetic import DrawnCamera, spread_poses, true_corners
 from bikeped.types import ImageArray
 
 PATTERN = BoardPattern(8, 6, 0.04)

@@ -14,16 +14,16 @@ import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
 
-from bikeped.calibration.coverage import Coverage, Part, cover, empty_parts
-from bikeped.calibration.live import Answer, Guide
-from bikeped.calibration.live_page import LivePage, live_routes
-from bikeped.calibration.live_session import LiveSession, assumed_lens, capture_boards
-from bikeped.calibration.render import draw_picture
-from bikeped.calibration.synthetic import BoardPose, DrawnCamera, draw_views, spread_poses
-from bikeped.calibration.views import BoardPattern, BoardView
 from bikeped.capture import FrameSource
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.geometry import Lens
+from bikeped.lab.calibration.board_render import draw_picture
+from bikeped.lab.calibration.board_view import BoardPattern, BoardView
+from bikeped.lab.calibration.capture.coverage import Coverage, Part, cover, empty_parts
+from bikeped.lab.calibration.capture.guide import Answer, Guide
+from bikeped.lab.calibration.capture.live_page import LivePage, live_routes
+from bikeped.lab.calibration.capture.live_session import LiveSession, assumed_lens, capture_boards
+from bikeped.lab.calibration.synthetic import BoardPose, DrawnCamera, draw_views, spread_poses
 from bikeped.types import Frame, ImageArray
 
 PATTERN = BoardPattern(7, 6, 0.04)

@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.calibration.adjust import adjust
-from bikeped.calibration.check import Checked
-from bikeped.calibration.corners import find_board, find_boards
-from bikeped.calibration.model import Model
-from bikeped.calibration.partial import LEAST_SHARE, partial_board
-from bikeped.calibration.pictures import Picture
-from bikeped.calibration.prepare import prepare
-from bikeped.calibration.render import Look, draw_picture
-from bikeped.calibration.synthetic import BoardPose, DrawnCamera, spread_poses, true_corners
-from bikeped.calibration.views import BoardPattern
 from bikeped.geometry import Lens
+from bikeped.lab.calibration.board_render import Look, draw_picture
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.capture.pictures import Picture
+from bikeped.lab.calibration.corners.board_check import Checked
+from bikeped.lab.calibration.corners.find_boards import find_board, find_boards
+from bikeped.lab.calibration.corners.partial_board import LEAST_SHARE, partial_board
+from bikeped.lab.calibration.solver.bundle_adjustment import adjust
+from bikeped.lab.calibration.solver.lens_model import Model
+from bikeped.lab.calibration.solver.observations import prepare
+from bikeped.lab.calibration.synthetic import BoardPose, DrawnCamera, spread_poses, true_corners
 from bikeped.types import FloatArray, ImageArray
 
 PATTERN = BoardPattern(8, 6, 0.04)
@@ -103,7 +103,9 @@ def test_a_board_cut_by_the_picture_s_edge() -> None:
 def no_whole_board(monkeypatch: pytest.MonkeyPatch) -> None:
     """The detectors of whole boards find nothing, at once instead of after seconds."""
     for name in ("raw_candidates", "remapped_candidates"):
-        monkeypatch.setattr(f"bikeped.calibration.corners.{name}", lambda grey, pattern: iter(()))
+        monkeypatch.setattr(
+            f"bikeped.lab.calibration.corners.find_boards.{name}", lambda grey, pattern: iter(())
+        )
 
 
 @pytest.mark.usefixtures("no_whole_board")
@@ -125,7 +127,7 @@ def test_a_live_frame_has_no_time_for_it(monkeypatch: pytest.MonkeyPatch) -> Non
         called.append(pattern)
         return "asked"
 
-    monkeypatch.setattr("bikeped.calibration.corners.partial_board", asked)
+    monkeypatch.setattr("bikeped.lab.calibration.corners.find_boards.partial_board", asked)
     assert find_board(draw(0, 0.35), PATTERN, thorough=False).board is None
     assert not called
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.calibration.pictures import load_pictures, pictures_hash, sharpness
 from bikeped.errors import CalibrationError
+from bikeped.lab.calibration.capture.pictures import load_pictures, pictures_hash, sharpness
 
 
 def write(path: Path, width: int = 64, height: int = 48, seed: int = 0) -> Path:

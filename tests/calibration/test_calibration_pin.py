@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.calibration.grow import Grid
-from bikeped.calibration.pin import LEAST_IN_LINE, pin
-from bikeped.calibration.views import BoardPattern
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.corners.corner_ids import LEAST_IN_LINE, pin
+from bikeped.lab.calibration.corners.grid_growing import Grid
 from bikeped.types import BoolArray, ImageArray, IntArray
 
 SIDE = 12

@@ -14,19 +14,24 @@ import numpy as np
 import pytest
 from calibration_scenes import boards, camera, found
 
-from bikeped.calibration.circle import brightest, circle_radius_px
-from bikeped.calibration.compare import Calibrated, calibrate, recommend
-from bikeped.calibration.model import Model
-from bikeped.calibration.outliers import LeftOut
-from bikeped.calibration.prepare import prepare
-from bikeped.calibration.report import Told, report_page
-from bikeped.calibration.report_pictures import Thumbnail
-from bikeped.calibration.results import cautions_of
-from bikeped.calibration.views import Refused
-from bikeped.calibration.write import Field, calibration_data, field_of_view, write_calibration
 from bikeped.config import ground_camera, load_config
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens
+from bikeped.lab.calibration.board_view import Refused
+from bikeped.lab.calibration.report.board_images import Thumbnail
+from bikeped.lab.calibration.report.calibration_file import (
+    Field,
+    calibration_data,
+    field_of_view,
+    write_calibration,
+)
+from bikeped.lab.calibration.report.html_report import Told, report_page
+from bikeped.lab.calibration.report.results import cautions_of
+from bikeped.lab.calibration.solver.compare import Calibrated, calibrate, recommend
+from bikeped.lab.calibration.solver.image_circle import brightest, circle_radius_px
+from bikeped.lab.calibration.solver.lens_model import Model
+from bikeped.lab.calibration.solver.observations import prepare
+from bikeped.lab.calibration.solver.outliers import LeftOut
 from bikeped.lab.simulation.suite import Suite
 from bikeped.service.viewpoint import Viewpoint
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.calibration.saddles import links, saddles
+from bikeped.lab.calibration.corners.saddle_points import links, saddles
 from bikeped.types import FloatArray, ImageArray
 
 

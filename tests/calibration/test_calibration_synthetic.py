@@ -9,9 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.calibration.refine import refine
-from bikeped.calibration.render import Look, draw_picture
-from bikeped.calibration.synthetic import (
+from bikeped.errors import GeometryError
+from bikeped.geometry import Lens
+from bikeped.lab.calibration.board_render import Look, draw_picture
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.corners.refine import refine
+from bikeped.lab.calibration.synthetic import (
     BoardBend,
     BoardPose,
     DrawnCamera,
@@ -20,9 +23,6 @@ from bikeped.calibration.synthetic import (
     true_corners,
     turn,
 )
-from bikeped.calibration.views import BoardPattern
-from bikeped.errors import GeometryError
-from bikeped.geometry import Lens
 
 PATTERN = BoardPattern(8, 6, 0.04)
 

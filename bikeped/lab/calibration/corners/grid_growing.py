@@ -1,0 +1,252 @@
+"""Grids of crossings, grown neighbour by neighbour, whatever hides the rest of the board.
+
+A grid counts its own columns and rows: which ones of the board they are, `partial.py` says.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from bikeped.lab.calibration.corners.local_grid import LocalMap, crossing, local_map, misfit
+from bikeped.lab.calibration.corners.saddle_points import Saddles, links, saddles
+from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
+
+_FEWEST = 6  # corners that a grid begins with
+_GRIDS = 3  # of a picture, the largest
+_CLEAN = 0.3  # `crossing` of a corner that is one
+_OFF = 0.2  # squares from where the neighbours expect a corner
+_SNAP = 0.25  # the same for a new one, which they can only continue to
+_PARALLEL = np.cos(np.radians(25.0))  # its edges and theirs
+_NEAR = 3  # columns and rows to either side that tell where a new corner must lie ...
+_TOLD_BY = 5  # ... by at least so many corners
+_ROUNDS = 40
+_STEPS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Corners `cell` [n, 2] (column, row; whole numbers, from anywhere) at `uv_px` [n, 2].
+
+    Columns and rows are not mirrored: rows run down where columns run to the right. `dark` says
+    whether the square up-left of cell (0, 0) is a dark one.
+    """
+
+    cell: IntArray
+    uv_px: FloatArray
+    dark: bool
+
+    def __len__(self) -> int:
+        return len(self.cell)
+
+    def sign(self, cell: IntArray) -> FloatArray:
+        """[n] what `crossing` must say of the colours at these cells: 1 or -1."""
+        even = cell.sum(1) % 2 == 0
+        return np.where(even == self.dark, 1.0, -1.0)
+
+    def lights(self, cell: IntArray, step: FloatArray) -> FloatArray:
+        """[n, k] what the squares at `step` [k, 2] from corners at cells [n, 2] are: 1 light,
+        -1 dark."""
+        return np.asarray(-self.sign(cell)[:, None] * np.sign(step[:, 0] * step[:, 1]))
+
+    def near(self, cell: IntArray) -> LocalMap:
+        """How pixels run with squares about any cells [m, 2], also empty ones."""
+        return local_map(cell.astype(np.float64), self.cell.astype(np.float64), self.uv_px)
+
+
+def grids(grey: ImageArray) -> list[Grid]:
+    """The largest grids in a picture, largest first, none with a corner of another."""
+    points = saddles(grey)
+    taken = np.zeros(len(points), np.bool_)
+    out = []
+    for number, start in enumerate(_components(points, links(grey, points))):
+        if number == _GRIDS:
+            break
+        if taken[start.point].any():
+            continue
+        grown = _grown(grey, points, start)
+        if grown is not None:
+            taken[grown.point] = True
+            out.append(grown.grid(points))
+    return sorted(out, key=len, reverse=True)
+
+
+@dataclass(frozen=True)
+class _Growing:
+    """Cells [n, 2], which saddle each holds [n], and the type of cell (0, 0)'s edge along rows."""
+
+    cell: IntArray
+    point: IntArray
+    kind: int
+
+    def kinds(self, cell: IntArray) -> IntArray:
+        """[n] the type that an edge along a row has at these cells: it alternates."""
+        return np.asarray((cell.sum(1) + self.kind) % 2)
+
+    def keep(self, which: BoolArray | IntArray) -> _Growing:
+        return replace(self, cell=self.cell[which], point=self.point[which])
+
+    def with_more(self, cell: IntArray, point: IntArray) -> _Growing:
+        return replace(
+            self,
+            cell=np.concatenate([self.cell, cell]),
+            point=np.concatenate([self.point, point]),
+        )
+
+    def grid(self, points: Saddles) -> Grid:
+        # Light to the left of the edge that runs right from (0, 0): above it, so dark up-left.
+        return Grid(self.cell, points.uv_px[self.point], self.kind == 0)
+
+
+def _components(points: Saddles, link: IntArray) -> Iterator[_Growing]:
+    """What hangs together by links, numbered from a first saddle each, largest first."""
+    left = set(np.flatnonzero((link >= 0).sum((1, 2)) >= 2).tolist())
+    found = []
+    for seed in sorted(left, key=lambda n: (-int((link[n] >= 0).sum()), n)):
+        if seed in left:
+            part = _component(points, link, seed, left)
+            left -= set(part.point.tolist())
+            found.append(part)
+    found = [part for part in found if len(part.cell) >= _FEWEST]
+    yield from sorted(found, key=lambda part: -len(part.cell))
+
+
+def _component(points: Saddles, link: IntArray, seed: int, free: set[int]) -> _Growing:
+    """Numbers a saddle's neighbours, theirs, and so on; the first number that one gets stays."""
+    cells = {(0, 0): seed}
+    right_of = {seed: (0, 0)}  # each saddle's edge to the right: type, and 1 against the edge
+    at = {seed: (0, 0)}
+    waiting = deque([seed])
+    while waiting:
+        one = waiting.popleft()
+        kind, against = right_of[one]
+        right = points.edge[one, kind] * (1 - 2 * against)
+        down_kind = 1 - kind
+        turned = (
+            right[0] * points.edge[one, down_kind, 1] - right[1] * points.edge[one, down_kind, 0]
+        )
+        down_against = int(turned < 0)
+        for step in _STEPS:
+            along_row = step[0] != 0
+            way_kind = kind if along_row else down_kind
+            way = (against if along_row else down_against) ^ int(step.sum() < 0)
+            other = int(link[one, way_kind, way])
+            place = (at[one][0] + int(step[0]), at[one][1] + int(step[1]))
+            if other not in free or other in at or place in cells:
+                continue
+            cells[place], at[other] = other, place
+            # Types alternate; its right points as this one's does.
+            way_right = points.edge[other, 1 - kind]
+            if along_row:
+                travel = (points.uv_px[other] - points.uv_px[one]) * step[0]
+                right_of[other] = 1 - kind, int(travel @ way_right < 0)
+            else:
+                travel = (points.uv_px[other] - points.uv_px[one]) * step[1]
+                down = points.edge[other, kind]
+                down = down if travel @ down > 0 else -down
+                cross = way_right[0] * down[1] - way_right[1] * down[0]
+                right_of[other] = 1 - kind, int(cross < 0)
+            waiting.append(other)
+    cell = np.array(list(cells), np.int64).reshape(-1, 2)
+    return _Growing(cell, np.array(list(cells.values()), np.int64), 0)
+
+
+def _grown(grey: ImageArray, points: Saddles, start: _Growing) -> _Growing | None:
+    """Cleaned, continued as far as the picture shows crossings, and cleaned again."""
+    now = _clean(grey, points, start)
+    for _ in range(_ROUNDS):
+        if now is None:
+            return None
+        # Two steps only where one leads nowhere: over a finger, to the other side.
+        more = _next(grey, points, now, 1)
+        if more is None:
+            more = _next(grey, points, now, 2)
+        if more is None:
+            break
+        before = len(now.cell)
+        now = _clean(grey, points, more)
+        if now is not None and len(now.cell) <= before:
+            break
+    return now
+
+
+def _next(grey: ImageArray, points: Saddles, now: _Growing, far: int) -> _Growing | None:
+    """With the saddles that lie `far` steps on, where the grid expects them; None without any."""
+    held = {(int(c), int(r)) for c, r in now.cell}
+    wanted = sorted(
+        {(c + int(s[0]) * far, r + int(s[1]) * far) for c, r in held for s in _STEPS} - held
+    )
+    cell = np.array(wanted, np.int64).reshape(-1, 2)
+    close = (np.abs(cell[:, None] - now.cell[None]) <= _NEAR + far - 1).all(2)
+    told = close.sum(1) >= _TOLD_BY
+    for axis in (0, 1):  # a single row does not say where the next one lies
+        place = np.where(close, now.cell[None, :, axis], 10**6)
+        told &= place.min(1) < np.where(close, now.cell[None, :, axis], -(10**6)).max(1)
+    cell = cell[told]
+    if not len(cell):
+        return None
+    grid = now.grid(points)
+    near = grid.near(cell)
+    free = np.setdiff1d(np.arange(len(points)), now.point)
+    if not len(free):
+        return None
+    away = np.linalg.norm(points.uv_px[free][None] - near.at_px[:, None], axis=-1)
+    nearest = away.argmin(1)
+    point, off = free[nearest], away[np.arange(len(cell)), nearest]
+    spacing = near.spacing_px
+    good = off < _SNAP * spacing.min(1)
+    kind = now.kinds(cell)
+    for axis in (0, 1):
+        way = near.along_px[:, :, axis] / np.maximum(spacing[:, axis, None], 1e-9)
+        edge = points.edge[point, kind if axis == 0 else 1 - kind]
+        good &= np.abs((edge * way).sum(1)) > _PARALLEL
+    there = replace(near, at_px=points.uv_px[point])
+    good &= crossing(grey, there) * grid.sign(cell) > _CLEAN
+    # A saddle can be one corner only: of two cells that want it, the nearer has it.
+    order = np.lexsort((off, point))
+    order = order[good[order]]
+    order = order[np.unique(point[order], return_index=True)[1]]
+    return now.with_more(cell[order], point[order]) if len(order) else None
+
+
+def _clean(grey: ImageArray, points: Saddles, now: _Growing) -> _Growing | None:
+    """Without what is no crossing, or not where its neighbours expect one; None if few are left."""
+    for _ in range(len(now.cell)):
+        if len(now.cell) < _FEWEST or (np.ptp(now.cell, axis=0) < 1).any():
+            return None
+        grid = now.grid(points)
+        near = replace(grid.near(now.cell), at_px=grid.uv_px)
+        seen = now.cell.astype(np.float64)
+        off, _ = misfit(seen, grid.uv_px, np.ones(len(seen), np.bool_))
+        unclear = crossing(grey, near) * grid.sign(now.cell) < _CLEAN
+        if unclear.any():
+            # Their neighbours' maps are spoiled by them, too: these go at once, then look again.
+            now = now.keep(~unclear)
+        elif off.max() > _OFF:
+            now = now.keep(np.arange(len(off)) != int(off.argmax()))
+        else:
+            break
+    return _together(now)
+
+
+def _together(now: _Growing) -> _Growing | None:
+    """The largest part of a grid that hangs together, over gaps of one corner as well."""
+    low = now.cell.min(0)
+    at = now.cell - low
+    there = np.zeros(at.max(0) + 1, np.bool_)
+    there[at[:, 0], at[:, 1]] = True
+    wide = there.copy()
+    for axis in (0, 1):
+        both = np.zeros_like(there)
+        middle = np.moveaxis(both, axis, 0)
+        rows = np.moveaxis(there, axis, 0)
+        middle[1:-1] = rows[:-2] & rows[2:]
+        wide |= both
+    part = cv2.connectedComponents(wide.astype(np.uint8), connectivity=4)[1]
+    mine = part[at[:, 0], at[:, 1]]
+    keep = mine == int(np.bincount(mine).argmax())
+    return now.keep(keep) if keep.sum() >= _FEWEST else None
