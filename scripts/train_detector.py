@@ -32,9 +32,15 @@ from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.rendering.random_scene import USUAL_MIX
-from bikeped.models import BUNDLED_FILE
-from bikeped.training.augment import AugmentSettings, augment_data
-from bikeped.training.card import (
+from bikeped.lab.training.augment import AugmentSettings, augment_data
+from bikeped.lab.training.coco import read_coco
+from bikeped.lab.training.crops import CropSettings
+from bikeped.lab.training.device import knows_bfloat16
+from bikeped.lab.training.drawn import DrawnSettings, draw_set
+from bikeped.lab.training.export import export_network
+from bikeped.lab.training.fit import FitSettings, fit
+from bikeped.lab.training.hard_negative_mining import AFTER, MiningSettings
+from bikeped.lab.training.model_card import (
     DrawnTest,
     by_light,
     choose_confidence,
@@ -42,22 +48,16 @@ from bikeped.training.card import (
     summary,
     sweep,
 )
-from bikeped.training.card_spread import spread
-from bikeped.training.card_text import card_text
-from bikeped.training.coco import read_coco
-from bikeped.training.crops import CropSettings
-from bikeped.training.device import knows_bfloat16
-from bikeped.training.drawn import DrawnSettings, draw_set
-from bikeped.training.export import export_network
-from bikeped.training.fit import FitSettings, fit
-from bikeped.training.mining import AFTER, MiningSettings
-from bikeped.training.network import SmallNet, multiply_adds, shift_scores
-from bikeped.training.packing import PackSettings
-from bikeped.training.quantise import PICTURES as STEPS_FROM
-from bikeped.training.quantise import quantise, shown_pictures
-from bikeped.training.small import SmallOrder, train_small
-from bikeped.training.warp import WarpRanges
-from bikeped.training.weights import load_weights
+from bikeped.lab.training.model_card_bootstrap import spread
+from bikeped.lab.training.model_card_text import card_text
+from bikeped.lab.training.network import SmallNet, multiply_adds, shift_scores
+from bikeped.lab.training.packing import PackSettings
+from bikeped.lab.training.quantise import PICTURES as STEPS_FROM
+from bikeped.lab.training.quantise import quantise, shown_pictures
+from bikeped.lab.training.small import SmallOrder, train_small
+from bikeped.lab.training.warp import WarpRanges
+from bikeped.lab.training.weights import load_weights
+from bikeped.models import BUNDLED_FILE
 from bikeped.types import Kind
 
 #: The steps take less than an hour on two cores that multiply bfloat16 themselves.

@@ -136,9 +136,9 @@ def command(
     **ranges: tuple[float, float] | None,
 ) -> int:
     """Warp DATA (COCO's format: an annotation file, or its folder) by sampled fisheye lenses."""
-    from bikeped.training.augment import AugmentSettings, augment_data
-    from bikeped.training.coco import read_coco
-    from bikeped.training.warp import WarpRanges
+    from bikeped.lab.training.augment import AugmentSettings, augment_data
+    from bikeped.lab.training.coco import read_coco
+    from bikeped.lab.training.warp import WarpRanges
 
     given = {key: value for key, value in ranges.items() if value is not None}
     if projections:

@@ -22,8 +22,8 @@ from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
     from bikeped.lab.result_tables import Cell, Table
-    from bikeped.training.evaluate import Evaluation
-    from bikeped.training.measures import Row
+    from bikeped.lab.training.evaluate import Evaluation
+    from bikeped.lab.training.measures import Row
 
 
 @click.command("evaluate")
@@ -97,8 +97,8 @@ def command(
 
     With several models each is compared with the first: original before fisheye-trained.
     """
-    from bikeped.training.coco import read_coco
-    from bikeped.training.evaluate import EvaluationSettings, evaluate, load_models, write_curve
+    from bikeped.lab.training.coco import read_coco
+    from bikeped.lab.training.evaluate import EvaluationSettings, evaluate, load_models, write_curve
 
     if figure is not None:
         from bikeped.lab.plotting import require_matplotlib
@@ -131,7 +131,7 @@ def command(
         write_curve(curve_out, result.scores[-1].curve, curve_iou == "0.5")
         written.append(curve_out)
     if figure is not None:
-        from bikeped.training.evaluation_figures import draw_evaluation
+        from bikeped.lab.training.evaluation_figures import draw_evaluation
 
         written += draw_evaluation(result, figure)
     if json_path is not None:
@@ -149,7 +149,7 @@ def command(
 def tables(result: Evaluation) -> list[Table]:
     """The paper's detection table, by size, and by class where there is more than one."""
     from bikeped.lab.result_tables import Table
-    from bikeped.training.evaluation_figures import evaluation_rows
+    from bikeped.lab.training.evaluation_figures import evaluation_rows
 
     rows = [evaluation_rows(score) for score in result.scores]
     data = result.data
@@ -185,7 +185,7 @@ def tables(result: Evaluation) -> list[Table]:
 def _alarms(result: Evaluation) -> Table:
     """False alarms of what is deployed."""
     from bikeped.lab.result_tables import Table
-    from bikeped.training.evaluate import KIND_NAMES
+    from bikeped.lab.training.evaluate import KIND_NAMES
 
     pictures = result.data["images"]
     return Table(

@@ -82,16 +82,16 @@ def command(
             )
         model = weights
     else:
-        from bikeped.training.needs import need
+        from bikeped.lab.training.optional_deps import need
 
         need("torch", "model export")
-        from bikeped.training.export import export_any
+        from bikeped.lab.training.export import export_any
 
         model = weights.with_suffix(".onnx") if out is None else out
         _expect(model, ".onnx")
         summary = export_any(weights, model, size, int8)
     if engine is not None:
-        from bikeped.training.engine import build_engine
+        from bikeped.lab.training.engine import build_engine
 
         _expect(engine, ".engine")
         built = build_engine(

@@ -98,8 +98,8 @@ def command(
     json_path: str | None,
 ) -> int:
     """Train a detector on DATA (COCO's format: an annotation file, or its folder) and export it."""
-    from bikeped.training.coco import read_coco
-    from bikeped.training.needs import need
+    from bikeped.lab.training.coco import read_coco
+    from bikeped.lab.training.optional_deps import need
 
     need("torch", "model train")
     source = read_coco(data, images_dir)
@@ -109,8 +109,8 @@ def command(
     given += [("--weights", weights)] if weights is not None else []
     check_outputs(given, [("--out", name) for name in names])
     if network == "small":
-        from bikeped.training.mining import AFTER, MiningSettings
-        from bikeped.training.small import SmallOrder, train_small
+        from bikeped.lab.training.hard_negative_mining import AFTER, MiningSettings
+        from bikeped.lab.training.small import SmallOrder, train_small
 
         _refuse(validation, "--validation")
         _refuse(weights, "--weights")
@@ -120,7 +120,7 @@ def command(
         with progress_bar("train", count) as progress:
             summary = train_small(source, out, order, progress)
     else:
-        from bikeped.training.yolo import YoloOrder, train_yolo
+        from bikeped.lab.training.yolo import YoloOrder, train_yolo
 
         if mine:
             raise click.UsageError("--mine is for --network small; leave it out with a YOLO")

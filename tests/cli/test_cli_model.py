@@ -9,7 +9,7 @@ import pytest
 from coco_sets import annotation, write_set
 
 from bikeped.cli.main import main
-from bikeped.training import needs
+from bikeped.lab.training import optional_deps as needs
 
 with_torch = pytest.mark.skipif(
     importlib.util.find_spec("torch") is None,

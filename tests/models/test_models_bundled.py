@@ -14,6 +14,7 @@ from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
+from bikeped.lab.training.model_card_text import reached
 from bikeped.models import (
     BUNDLED,
     BUNDLED_FILE,
@@ -22,7 +23,6 @@ from bikeped.models import (
     model_file,
 )
 from bikeped.service.doctor import check_model
-from bikeped.training.card_text import reached
 from bikeped.types import Kind
 
 

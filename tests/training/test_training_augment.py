@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 
 from bikeped.errors import DataSetError, GeometryError
 from bikeped.geometry import Lens
-from bikeped.training.augment import (
+from bikeped.lab.training.augment import (
     AugmentSettings,
     augment_boxes,
     augment_data,
     augment_picture,
     picture_generator,
 )
-from bikeped.training.coco import read_coco
-from bikeped.training.warp import FILL, Warp, WarpRanges, sample_warp, warp_boxes, warp_picture
+from bikeped.lab.training.coco import read_coco
+from bikeped.lab.training.warp import FILL, Warp, WarpRanges, sample_warp, warp_boxes, warp_picture
 
 SMALL = WarpRanges(size_px=128)
 WIDE = WarpRanges(  # what an installer can ask for at most: boxes cut by circle and picture

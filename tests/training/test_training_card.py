@@ -10,8 +10,7 @@ import pytest
 from bikeped.config import load_config
 from bikeped.config.sections import DetectionConfig
 from bikeped.lab.rendering import DrawnObject, scene_camera
-from bikeped.models import BUNDLED_FILE
-from bikeped.training.card import (
+from bikeped.lab.training.model_card import (
     DrawnTest,
     Sight,
     by_light,
@@ -21,7 +20,8 @@ from bikeped.training.card import (
     summary,
     sweep,
 )
-from bikeped.training.card_spread import spread
+from bikeped.lab.training.model_card_bootstrap import spread
+from bikeped.models import BUNDLED_FILE
 from bikeped.types import Detections, Kind
 
 NAN = math.nan

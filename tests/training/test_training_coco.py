@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.errors import DataSetError
-from bikeped.training.coco import CocoImage, read_coco, read_picture, write_annotations
+from bikeped.lab.training.coco import CocoImage, read_coco, read_picture, write_annotations
 
 
 def entry(**changes):

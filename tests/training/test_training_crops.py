@@ -11,8 +11,15 @@ from coco_sets import annotation, edit, write_set
 
 from bikeped.detection.preprocess import PAD
 from bikeped.errors import DataSetError
-from bikeped.training.coco import read_coco
-from bikeped.training.crops import CropSettings, Cutter, View, class_ids, read_view, usual_places
+from bikeped.lab.training.coco import read_coco
+from bikeped.lab.training.crops import (
+    CropSettings,
+    Cutter,
+    View,
+    class_ids,
+    read_view,
+    usual_places,
+)
 
 PLAIN = CropSettings(
     view=(320, 192), window=(160, 96), light=0, cover=0, around_object=1, around_usual=0

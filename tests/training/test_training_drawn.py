@@ -9,8 +9,8 @@ import pytest
 from bikeped.config import load_config
 from bikeped.errors import DataSetError
 from bikeped.lab.rendering import DEFAULT_POSE
-from bikeped.training.coco import read_coco, read_picture
-from bikeped.training.drawn import DrawnSettings, draw_set, part_camera
+from bikeped.lab.training.coco import read_coco, read_picture
+from bikeped.lab.training.drawn import DrawnSettings, draw_set, part_camera
 
 LOADED = load_config(None)
 

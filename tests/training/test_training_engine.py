@@ -12,7 +12,7 @@ from onnx import TensorProto, helper
 
 from bikeped.detection.trt_engine import split_header
 from bikeped.errors import DetectorError
-from bikeped.training.engine import build_engine, onnx_facts
+from bikeped.lab.training.engine import build_engine, onnx_facts
 
 PLAN = b"ftrt\x00\x00\x00\x00 a serialised engine"
 FACTS = {"names": "{0: 'person'}", "imgsz": "[64, 96]", "task": "detect"}

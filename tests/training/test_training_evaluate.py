@@ -17,15 +17,15 @@ from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DataSetError, DetectorError
 from bikeped.lab.rendering.dataset import write_dataset
 from bikeped.lab.simulation.perception import AREA_SCALE
-from bikeped.training.coco import read_coco
-from bikeped.training.evaluate import (
+from bikeped.lab.training.coco import read_coco
+from bikeped.lab.training.evaluate import (
     EvaluationSettings,
     ModelUnderTest,
     evaluate,
     load_models,
 )
-from bikeped.training.evaluation_figures import draw_evaluation, evaluation_rows
-from bikeped.training.truths import INPUT_PX
+from bikeped.lab.training.evaluation_figures import draw_evaluation, evaluation_rows
+from bikeped.lab.training.ground_truth import INPUT_PX
 
 CPU = DetectionConfig(providers=("cpu",), threads=1)
 ONE = EvaluationSettings(least_objects=1)

@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 from bikeped.errors import BikepedError, DataSetError
 from bikeped.lab.experiments.montecarlo import load_recall_curve
 from bikeped.lab.simulation.perception import RecallModel
-from bikeped.training.evaluate import write_curve
-from bikeped.training.measures import Curve, Found, Truth, measure, recall_by_distance, recall_curve
+from bikeped.lab.training.evaluate import write_curve
+from bikeped.lab.training.measures import (
+    Curve,
+    Found,
+    Truth,
+    measure,
+    recall_by_distance,
+    recall_curve,
+)
 from bikeped.types import Kind
 
 NAMES = ("one", "two")

@@ -14,16 +14,16 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 from bikeped.config.sections import DetectionConfig  # noqa: E402
 from bikeped.detection import load_detector  # noqa: E402
 from bikeped.errors import DataSetError, DetectorError  # noqa: E402
-from bikeped.training.coco import read_coco, read_picture  # noqa: E402
-from bikeped.training.crops import CropSettings  # noqa: E402
-from bikeped.training.export import export_network, export_weights  # noqa: E402
-from bikeped.training.fit import (  # noqa: E402
+from bikeped.lab.training.coco import read_coco, read_picture  # noqa: E402
+from bikeped.lab.training.crops import CropSettings  # noqa: E402
+from bikeped.lab.training.export import export_network, export_weights  # noqa: E402
+from bikeped.lab.training.fit import (  # noqa: E402
     FitSettings,
     fit,
     learning_rate,
 )
-from bikeped.training.packing import PackSettings  # noqa: E402
-from bikeped.training.weights import is_small, load_weights, save_weights  # noqa: E402
+from bikeped.lab.training.packing import PackSettings  # noqa: E402
+from bikeped.lab.training.weights import is_small, load_weights, save_weights  # noqa: E402
 
 CROPS = CropSettings(view=(160, 96), window=(96, 64), light=0, cover=0)
 PACK = PackSettings(side=128, squares=2, pool=4)
@@ -95,7 +95,7 @@ def test_one_worker_and_two_both_learn_from_the_whole_batch(data):
 
 
 def test_the_first_steps_see_squares_and_the_last_ones_windows(data, monkeypatch):
-    from bikeped.training import fit as module
+    from bikeped.lab.training import fit as module
 
     seen = []
 
@@ -110,7 +110,7 @@ def test_the_first_steps_see_squares_and_the_last_ones_windows(data, monkeypatch
 
 
 def test_only_the_squares_are_looked_at_in_sixteen_bits(data, monkeypatch):
-    from bikeped.training import fit as module
+    from bikeped.lab.training import fit as module
 
     seen = []
 
@@ -199,7 +199,7 @@ def test_an_exported_file_is_what_the_detector_loads(fitted, tmp_path):
 
 
 def test_nothing_is_written_where_runtime_and_pytorch_disagree(fitted, tmp_path, monkeypatch):
-    from bikeped.training import onnx_file
+    from bikeped.lab.training import onnx_file
 
     monkeypatch.setattr(onnx_file, "_MOST_SCORE", -1.0)
     model = tmp_path / "model.onnx"

@@ -6,14 +6,14 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
-from bikeped.training.loss import (  # noqa: E402
+from bikeped.lab.training.loss import (  # noqa: E402
     Truth,
     assign,
     detection_loss,
     generalised_overlap,
     pair_overlap,
 )
-from bikeped.training.network import grid  # noqa: E402
+from bikeped.lab.training.network import grid  # noqa: E402
 
 CENTRE, STRIDE = grid(160, 96)
 NONE = torch.zeros(0, 4)
@@ -109,7 +109,7 @@ def test_every_object_has_a_cell_even_a_tiny_one_between_cells():
     # 3 x 5 pixels around the corner of four cells: no centre lies in it.
     what = truth([30.5, 30, 33.5, 35], [100, 60, 103, 64])
     _, edge = perfect(truth())
-    from bikeped.training.network import boxes_px
+    from bikeped.lab.training.network import boxes_px
 
     given = assign(
         torch.full((3, len(CENTRE)), 0.01), boxes_px(edge, CENTRE, STRIDE)[0], what, CENTRE

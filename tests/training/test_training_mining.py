@@ -12,12 +12,12 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 from test_training_fit import CROPS, SETTINGS, blobs  # noqa: E402
 
 from bikeped.detection.nms import overlap_matrix  # noqa: E402
-from bikeped.training.coco import MISTAKEN, furniture  # noqa: E402
-from bikeped.training.crops import Cutter, read_view, usual_places  # noqa: E402
-from bikeped.training.fit import fit, shown_size  # noqa: E402
-from bikeped.training.mining import MiningSettings, with_mistakes  # noqa: E402
-from bikeped.training.network import shift_scores  # noqa: E402
-from bikeped.training.packing import Packer, PackSettings  # noqa: E402
+from bikeped.lab.training.coco import MISTAKEN, furniture  # noqa: E402
+from bikeped.lab.training.crops import Cutter, read_view, usual_places  # noqa: E402
+from bikeped.lab.training.fit import fit, shown_size  # noqa: E402
+from bikeped.lab.training.hard_negative_mining import MiningSettings, with_mistakes  # noqa: E402
+from bikeped.lab.training.network import shift_scores  # noqa: E402
+from bikeped.lab.training.packing import Packer, PackSettings  # noqa: E402
 
 ALL = MiningSettings(confidence=0.05, processes=1)
 

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 
 from bikeped.detection.facts import ModelMetadata  # noqa: E402
 from bikeped.detection.layouts import anchor_count, choose_layout, decode  # noqa: E402
-from bikeped.training.network import (  # noqa: E402
+from bikeped.lab.training.network import (  # noqa: E402
     STRIDES,
     Exported,
     SmallNet,

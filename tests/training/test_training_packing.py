@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.training.crops import CropSettings, Cutter, View
-from bikeped.training.packing import BLOCK_PX, Packer, PackSettings, first_fit
+from bikeped.lab.training.crops import CropSettings, Cutter, View
+from bikeped.lab.training.packing import BLOCK_PX, Packer, PackSettings, first_fit
 
 CROPS = CropSettings(view=(480, 320), scale=(1.0, 1.0), flip=0.0, cover=0, light=0)
 PLAIN = PackSettings(empty=0.0, furniture=0.0, taken=(1.0,))

@@ -11,10 +11,10 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 from bikeped.config.sections import DetectionConfig  # noqa: E402
 from bikeped.detection import load_detector  # noqa: E402
 from bikeped.errors import DetectorError  # noqa: E402
-from bikeped.training.coco import read_coco  # noqa: E402
-from bikeped.training.export import export_network  # noqa: E402
-from bikeped.training.network import SmallNet  # noqa: E402
-from bikeped.training.quantise import quantise, shown_pictures  # noqa: E402
+from bikeped.lab.training.coco import read_coco  # noqa: E402
+from bikeped.lab.training.export import export_network  # noqa: E402
+from bikeped.lab.training.network import SmallNet  # noqa: E402
+from bikeped.lab.training.quantise import quantise, shown_pictures  # noqa: E402
 
 ort = pytest.importorskip("onnxruntime")
 SIZE = (128, 96)

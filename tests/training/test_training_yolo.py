@@ -20,12 +20,13 @@ from coco_sets import annotation, write_set
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.errors import DataSetError, DetectorError
-from bikeped.training.coco import read_coco
+from bikeped.lab.training.coco import read_coco
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
-from bikeped.training import needs, yolo  # noqa: E402
-from bikeped.training.yolo import YoloOrder, export_yolo, train_yolo, write_data  # noqa: E402
+from bikeped.lab.training import optional_deps as needs
+from bikeped.lab.training import yolo
+from bikeped.lab.training.yolo import YoloOrder, export_yolo, train_yolo, write_data  # noqa: E402
 
 
 class Network(torch.nn.Module):

@@ -10,7 +10,7 @@ import torch
 
 from bikeped.errors import DetectorError
 from bikeped.files import write_whole
-from bikeped.training.network import SmallNet
+from bikeped.lab.training.network import SmallNet
 
 FORMAT = "bikeped small detector 2"
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from bikeped.detection.preprocess import Preprocessor
 from bikeped.errors import DetectorError
 from bikeped.files import write_whole
-from bikeped.training.coco import CocoData, read_picture
+from bikeped.lab.training.coco import CocoData, read_picture
 from bikeped.types import Float32Array
 
 PICTURES = 64  #: are enough to take the steps from

@@ -14,8 +14,8 @@ import numpy as np
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection.classes import WITH_RIDER
 from bikeped.detection.riders import join_riders
-from bikeped.training.coco import CocoData, CocoImage, CocoObject
-from bikeped.training.measures import Truth
+from bikeped.lab.training.coco import CocoData, CocoImage, CocoObject
+from bikeped.lab.training.measures import Truth
 from bikeped.types import Detections, Kind
 
 #: Side of the network input that areas are measured at (definitions, section 3).

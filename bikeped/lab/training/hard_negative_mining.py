@@ -23,11 +23,11 @@ import numpy as np
 from bikeped.config.sections import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.nms import overlap_matrix
-from bikeped.training.coco import MISTAKEN, CocoData, CocoImage, furniture
-from bikeped.training.crops import reduced_picture
-from bikeped.training.export import export_network
-from bikeped.training.network import SmallNet
-from bikeped.training.quantise import quantise, shown_pictures
+from bikeped.lab.training.coco import MISTAKEN, CocoData, CocoImage, furniture
+from bikeped.lab.training.crops import reduced_picture
+from bikeped.lab.training.export import export_network
+from bikeped.lab.training.network import SmallNet
+from bikeped.lab.training.quantise import quantise, shown_pictures
 from bikeped.types import Float32Array, FloatArray, Kind
 
 #: Shares of the steps: while it still learns fast, and again before it sees plain windows.

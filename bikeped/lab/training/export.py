@@ -19,9 +19,9 @@ import torch
 from bikeped import __version__
 from bikeped.errors import DetectorError
 from bikeped.files import write_whole
-from bikeped.training.network import STRIDES, Exported, SmallNet
-from bikeped.training.onnx_file import compare, with_metadata
-from bikeped.training.weights import is_small, load_weights
+from bikeped.lab.training.network import STRIDES, Exported, SmallNet
+from bikeped.lab.training.onnx_file import compare, with_metadata
+from bikeped.lab.training.weights import is_small, load_weights
 
 _OPSET = 17
 
@@ -121,14 +121,14 @@ def export_any(weights: Path, out: Path, size: int, int8: Path | None = None) ->
             f"--int8: {weights} is no small network's; export without it, and let TensorRT or ONNX "
             "Runtime round a YOLO"
         )
-    from bikeped.training.yolo import export_yolo
+    from bikeped.lab.training.yolo import export_yolo
 
     return export_yolo(weights, out, size)
 
 
 def _in_int8(weights: Path, out: Path, data: Path) -> ExportSummary:
-    from bikeped.training.coco import read_coco
-    from bikeped.training.quantise import quantise, shown_pictures
+    from bikeped.lab.training.coco import read_coco
+    from bikeped.lab.training.quantise import quantise, shown_pictures
 
     pictures = read_coco(data)
     with tempfile.TemporaryDirectory() as folder:

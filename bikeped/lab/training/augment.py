@@ -24,7 +24,7 @@ import numpy.typing as npt
 from bikeped import __version__
 from bikeped.errors import DataSetError
 from bikeped.lab.process_pool import workers
-from bikeped.training.coco import (
+from bikeped.lab.training.coco import (
     CocoData,
     CocoImage,
     CocoObject,
@@ -32,7 +32,7 @@ from bikeped.training.coco import (
     read_picture,
     write_annotations,
 )
-from bikeped.training.warp import Warp, WarpRanges, sample_warp, warp_boxes, warp_picture
+from bikeped.lab.training.warp import Warp, WarpRanges, sample_warp, warp_boxes, warp_picture
 from bikeped.types import BoolArray, FloatArray, ImageArray
 
 #: An object of which less than this share of its area is left is dropped,

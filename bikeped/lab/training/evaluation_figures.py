@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bikeped.lab.plotting import SERIES, Sheet, plain, reals
-from bikeped.training.evaluate import Evaluation, Scores
-from bikeped.training.measures import Row
+from bikeped.lab.training.evaluate import Evaluation, Scores
+from bikeped.lab.training.measures import Row
 
 _TICKS = (4, 8, 16, 32, 64, 96, 128, 256, 512, 1024)  # sides of squares on the axis of areas
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import torch
 
-from bikeped.training.coco import CocoData
-from bikeped.training.crops import CropSettings
-from bikeped.training.device import knows_bfloat16, named_device
-from bikeped.training.export import export_network
-from bikeped.training.fit import FitSettings, fit, settings_as_dict
-from bikeped.training.mining import MiningSettings
-from bikeped.training.weights import save_weights
+from bikeped.lab.training.coco import CocoData
+from bikeped.lab.training.crops import CropSettings
+from bikeped.lab.training.device import knows_bfloat16, named_device
+from bikeped.lab.training.export import export_network
+from bikeped.lab.training.fit import FitSettings, fit, settings_as_dict
+from bikeped.lab.training.hard_negative_mining import MiningSettings
+from bikeped.lab.training.weights import save_weights
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.lab.rendering.dataset import PICTURES_A_STREET
-from bikeped.training.card import NEAR_M, Sight
+from bikeped.lab.training.model_card import NEAR_M, Sight
 from bikeped.types import FloatArray, Kind
 
 _KINDS = (Kind.PEDESTRIAN, Kind.CYCLIST)

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from bikeped.errors import DataSetError
-from bikeped.training.coco import CocoData
-from bikeped.training.crops import (
+from bikeped.lab.training.coco import CocoData
+from bikeped.lab.training.crops import (
     LARGEST_WINDOW_PX,
     Crop,
     CropSettings,
@@ -29,11 +29,11 @@ from bikeped.training.crops import (
     read_view,
     usual_places,
 )
-from bikeped.training.loss import Truth, detection_loss
-from bikeped.training.mining import MiningSettings, with_mistakes
-from bikeped.training.muon import Muon
-from bikeped.training.network import STRIDES, SmallNet, grid
-from bikeped.training.packing import BLOCK_PX, Packer, PackSettings
+from bikeped.lab.training.hard_negative_mining import MiningSettings, with_mistakes
+from bikeped.lab.training.loss import Truth, detection_loss
+from bikeped.lab.training.muon import Muon
+from bikeped.lab.training.network import STRIDES, SmallNet, grid
+from bikeped.lab.training.packing import BLOCK_PX, Packer, PackSettings
 
 _REPORT_EVERY = 100  #: steps
 _STEEPEST_GRADIENT = 10.0

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.training.coco import MISTAKEN
-from bikeped.training.crops import Crop, CropSettings, Cutter, View
+from bikeped.lab.training.coco import MISTAKEN
+from bikeped.lab.training.crops import Crop, CropSettings, Cutter, View
 from bikeped.types import BoolArray, FloatArray
 
 BLOCK_PX = 64

@@ -21,9 +21,9 @@ import numpy as np
 
 from bikeped.errors import DataSetError, DetectorError
 from bikeped.files import make_folder, write_whole
-from bikeped.training.coco import CocoData, CocoImage, write_annotations
-from bikeped.training.needs import need
-from bikeped.training.onnx_file import compare, with_metadata
+from bikeped.lab.training.coco import CocoData, CocoImage, write_annotations
+from bikeped.lab.training.onnx_file import compare, with_metadata
+from bikeped.lab.training.optional_deps import need
 
 _VALIDATION_SHARE = 20  #: one picture in so many, where no validation set is named
 _OPSET = 17

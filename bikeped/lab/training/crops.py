@@ -17,7 +17,7 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.preprocess import PAD, Letterbox
 from bikeped.errors import CaptureError, DataSetError
-from bikeped.training.coco import MISTAKEN, Box, CocoData, CocoImage, furniture, read_picture
+from bikeped.lab.training.coco import MISTAKEN, Box, CocoData, CocoImage, furniture, read_picture
 from bikeped.types import FloatArray, ImageArray, IntArray
 
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored

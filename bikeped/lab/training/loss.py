@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from bikeped.training.network import boxes_px
+from bikeped.lab.training.network import boxes_px
 
 _SCORE_POWER, _OVERLAP_POWER = 0.5, 6.0  #: of the alignment: score^0.5 * overlap^6
 #: A score is asked to be the overlap to this power: who is tiny, or half hidden, is never boxed as

@@ -27,7 +27,7 @@ from bikeped.types import FloatArray, ImageArray
 
 _JPEG = b"\xff\xd8"
 _LARGEST_SIDE = 32768
-#: Among the furniture of a picture: what a network took for somebody (`bikeped.training.mining`).
+#: Among the furniture of a picture: what a network took for somebody (`bikeped.lab.training.hard_negative_mining`).
 MISTAKEN = "mistaken"
 Box = tuple[float, float, float, float]  #: x1, y1, x2, y2 in pixels of a picture
 

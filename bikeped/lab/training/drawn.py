@@ -23,7 +23,7 @@ from bikeped.errors import DataSetError
 from bikeped.files import make_folder
 from bikeped.geometry import CameraPose
 from bikeped.lab.rendering import DEFAULT_POSE, Mix, SceneCamera, scene_camera, write_dataset
-from bikeped.training.coco import write_annotations
+from bikeped.lab.training.coco import write_annotations
 
 #: Seeds of parts begin here, so that no set shares a street with another: training from
 #: `seed` * this, below the next one.

@@ -37,8 +37,15 @@ from bikeped.detection.nms import suppress
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DataSetError
 from bikeped.files import write_whole
-from bikeped.training.coco import CocoData, read_picture
-from bikeped.training.measures import (
+from bikeped.lab.training.coco import CocoData, read_picture
+from bikeped.lab.training.ground_truth import (
+    INPUT_PX,
+    joined_truth,
+    kinds_by_name,
+    plain_name,
+    truth_of,
+)
+from bikeped.lab.training.measures import (
     Curve,
     Found,
     Measures,
@@ -47,13 +54,6 @@ from bikeped.training.measures import (
     recall_by_distance,
     recall_curve,
     require_pycocotools,
-)
-from bikeped.training.truths import (
-    INPUT_PX,
-    joined_truth,
-    kinds_by_name,
-    plain_name,
-    truth_of,
 )
 from bikeped.types import Detections, Kind
 
