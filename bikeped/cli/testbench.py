@@ -20,7 +20,7 @@ from bikeped.files import write_whole
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 
 if TYPE_CHECKING:
-    from bikeped.web.testbench_settings import Bench
+    from bikeped.lab.testbench.settings import Bench
 
 
 @click.group("testbench", invoke_without_command=True)
@@ -50,9 +50,9 @@ def command(
         return
     import msgspec
 
+    from bikeped.lab.testbench.contest import Origin
+    from bikeped.lab.testbench.pages import add_testbench
     from bikeped.web.serve import serve_pages
-    from bikeped.web.testbench import add_testbench
-    from bikeped.web.testbench_contest import Origin
 
     loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
     web = loaded.config.web
@@ -90,10 +90,10 @@ def contest(
 
     FILE_OR_LINK is the file, or the page's address with all that follows its #.
     """
-    from bikeped.web.testbench_contest import Origin
-    from bikeped.web.testbench_contest import challenge as run
-    from bikeped.web.testbench_run import Workbench, trial_summaries
-    from bikeped.web.testbench_settings import in_force, parse_link
+    from bikeped.lab.testbench.contest import Origin
+    from bikeped.lab.testbench.contest import challenge as run
+    from bikeped.lab.testbench.run import Workbench, trial_summaries
+    from bikeped.lab.testbench.settings import in_force, parse_link
 
     file = _as_file(challenge)
     loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
@@ -131,7 +131,7 @@ def export(
 
     It opens from the disk without a network, to be mailed or printed.
     """
-    from bikeped.web.export import make_report
+    from bikeped.lab.testbench.export import make_report
 
     loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
     with progress_bar("scenarios", len(scenarios)) as tell:
@@ -161,7 +161,7 @@ def _as_file(challenge: str) -> Path | None:
 
 
 def _read(path: Path) -> Bench:
-    from bikeped.web.testbench_settings import parse_file
+    from bikeped.lab.testbench.settings import parse_file
 
     try:
         if path.stat().st_size > 1_000_000:

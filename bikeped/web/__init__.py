@@ -4,7 +4,7 @@ How a page is made. Each page is a module with one function that adds it to an a
 
     add_live(app, live)                      bikeped/web/live.py
     add_align(app, ...)                      bikeped/web/align.py
-    add_testbench(app, ...)                  bikeped/web/testbench.py
+    add_testbench(app, ...)                  bikeped/lab/testbench/pages.py
 
 It calls `server.add_page(app, Page("/align", "Align", ...))`, which serves `static/<body>.html`
 inside the common frame with its entry in the navigation, and adds its own routes below the page's

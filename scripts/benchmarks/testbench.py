@@ -97,10 +97,10 @@ class _Served:
 
     async def _run(self) -> None:
         from bikeped.config import WebConfig
+        from bikeped.lab.testbench.pages import add_testbench
         from bikeped.telemetry.http import HttpServer
         from bikeped.web.security import open_access
         from bikeped.web.server import make_pages
-        from bikeped.web.testbench import add_testbench
 
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         config = WebConfig(port=0)

@@ -15,11 +15,11 @@ from aiohttp.test_utils import TestClient, TestServer
 from bikeped.cli.main import main
 from bikeped.config import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.testbench.contest import Origin
+from bikeped.lab.testbench.pages import add_testbench
+from bikeped.lab.testbench.settings import in_force
 from bikeped.web.security import Access
 from bikeped.web.server import make_pages
-from bikeped.web.testbench import add_testbench
-from bikeped.web.testbench_contest import Origin
-from bikeped.web.testbench_settings import in_force
 
 OWN = """
 name: My crossing

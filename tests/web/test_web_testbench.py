@@ -15,10 +15,10 @@ from bikeped.lab.experiments.latency import sweep
 from bikeped.lab.experiments.montecarlo import Plan, plan_trials, sorted_suite, summaries
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
+from bikeped.lab.testbench.playback import TESTS, coverage, playback
+from bikeped.lab.testbench.run import Workbench, trial_summaries
+from bikeped.lab.testbench.settings import Pose
 from bikeped.types import State
-from bikeped.web.testbench_playback import TESTS, coverage, playback
-from bikeped.web.testbench_run import Workbench, trial_summaries
-from bikeped.web.testbench_settings import Pose
 
 
 @pytest.fixture(scope="module")

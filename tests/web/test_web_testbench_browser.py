@@ -13,7 +13,7 @@ from web_fakes import PHONE
 from bikeped.cli.main import main
 from bikeped.lab.scenarios.scenario import load_scenario, parse_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.web.export import make_report
+from bikeped.lab.testbench.export import make_report
 
 
 @pytest.fixture

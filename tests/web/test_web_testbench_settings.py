@@ -16,8 +16,8 @@ from testbench_fakes import BASE, MARKUP, OWN, bench, pages
 
 from bikeped.config import DecisionConfig
 from bikeped.errors import BikepedError, ScenarioError
-from bikeped.web.testbench import Desk, ranges
-from bikeped.web.testbench_settings import (
+from bikeped.lab.testbench.pages import Desk, ranges
+from bikeped.lab.testbench.settings import (
     Bench,
     Danger,
     Delay,

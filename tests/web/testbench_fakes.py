@@ -11,9 +11,9 @@ from web_fakes import OPEN
 
 from bikeped.config import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.testbench.pages import add_testbench
+from bikeped.lab.testbench.settings import Bench, in_force
 from bikeped.web.server import make_pages
-from bikeped.web.testbench import add_testbench
-from bikeped.web.testbench_settings import Bench, in_force
 
 LOADED = load_config()
 SCENARIOS = load_scenarios(bundled_folder())

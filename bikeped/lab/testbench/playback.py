@@ -19,8 +19,8 @@ from bikeped.lab.experiments.deterministic import onsets
 from bikeped.lab.simulation.metrics import measure, number
 from bikeped.lab.simulation.simulate import FPS, verdicts
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, Truth
+from bikeped.lab.testbench.run import BenchSuite
 from bikeped.types import BoolArray, FloatArray, Kind, State
-from bikeped.web.testbench_run import BenchSuite
 
 #: Codes of the truth's tiers in `truth.tier`.
 TIERS = ("none", "actionable", "imminent")

@@ -31,11 +31,11 @@ from bikeped.lab.experiments.report import (
 )
 from bikeped.lab.result_tables import Result
 from bikeped.lab.scenarios.scenario import Scenario
-from bikeped.web.testbench import configurations
-from bikeped.web.testbench_contest import runs
-from bikeped.web.testbench_playback import coverage, playback
-from bikeped.web.testbench_run import BenchSuite, Workbench
-from bikeped.web.testbench_settings import in_force
+from bikeped.lab.testbench.contest import runs
+from bikeped.lab.testbench.pages import configurations
+from bikeped.lab.testbench.playback import coverage, playback
+from bikeped.lab.testbench.run import BenchSuite, Workbench
+from bikeped.lab.testbench.settings import in_force
 
 _STATIC = Path(__file__).with_name("static")
 #: In the order in which they need one another.

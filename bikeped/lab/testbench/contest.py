@@ -20,8 +20,8 @@ from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.lab.governance.contest import Contest, Side, contest
 from bikeped.lab.governance.gates import check
-from bikeped.web.testbench_run import Workbench
-from bikeped.web.testbench_settings import VIEW, Bench, file_of, in_force, link_of
+from bikeped.lab.testbench.run import Workbench
+from bikeped.lab.testbench.settings import VIEW, Bench, file_of, in_force, link_of
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,10 @@ from bikeped.config.section import Section
 from bikeped.lab.experiments.optimizer import BOUNDS
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.web.server import Page, add_page, json_answer, json_body
-from bikeped.web.testbench_contest import Origin, contest_answer
-from bikeped.web.testbench_playback import TESTS, TIERS, coverage, playback
-from bikeped.web.testbench_run import Workbench, trial_summaries
-from bikeped.web.testbench_settings import (
+from bikeped.lab.testbench.contest import Origin, contest_answer
+from bikeped.lab.testbench.playback import TESTS, TIERS, coverage, playback
+from bikeped.lab.testbench.run import Workbench, trial_summaries
+from bikeped.lab.testbench.settings import (
     MAX_SCRIPT_CHARS,
     Bench,
     check_bench,
@@ -39,6 +38,7 @@ from bikeped.web.testbench_settings import (
     parse_link,
     parse_own,
 )
+from bikeped.web.server import Page, add_page, json_answer, json_body
 
 T = TypeVar("T")
 

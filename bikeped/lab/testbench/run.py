@@ -28,7 +28,7 @@ from bikeped.lab.simulation.perception import RecallModel, Seen, see
 from bikeped.lab.simulation.simulate import Run, Scene, Tracked, delayed, rows_of, track
 from bikeped.lab.simulation.suite import Suite
 from bikeped.lab.simulation.truth import Truth, TruthSettings, judge_truth
-from bikeped.web.testbench_settings import (
+from bikeped.lab.testbench.settings import (
     Bench,
     Delay,
     Perception,
