@@ -53,7 +53,7 @@ def command(
 
     Without a configured detector the bundled one looks at the pictures.
     """
-    from bikeped.demo import bundled_scenario, format_summary, summarise
+    from bikeped.lab.demo import bundled_scenario, format_summary, summarise
     from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera, sidecar_path
     from bikeped.lab.rendering.clip import frame_times, write_clip
     from bikeped.lab.scenarios.scenario import load_scenario

@@ -9,7 +9,7 @@ from functools import cache
 def street_4k(count: int) -> list[bytes]:
     """`count` frames of the demo's crossing at 3840 x 2160, spread over its length."""
     from bikeped.config import load_config
-    from bikeped.demo import bundled_scenario
+    from bikeped.lab.demo import bundled_scenario
     from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
     from bikeped.lab.rendering.clip import encode_jpeg
     from bikeped.lab.scenarios.scenario import load_scenario

@@ -5,7 +5,7 @@ import pytest
 from drawn_eyes import boxes
 
 from bikeped.config import load_config
-from bikeped.demo import bundled_scenario, format_summary, summarise
+from bikeped.lab.demo import bundled_scenario, format_summary, summarise
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import load_scenario
 from bikeped.service.judge import Judge

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bikeped.demo.summary import format_summary, summarise
+from bikeped.lab.demo.summary import format_summary, summarise
 
 __all__ = ["bundled_scenario", "format_summary", "summarise"]
 
