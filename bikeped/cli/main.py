@@ -16,15 +16,15 @@ from bikeped.errors import BikepedError
 COMMANDS = {
     "run": "bikeped.cli.run",
     "replay": "bikeped.cli.replay",
-    "demo": "bikeped.cli.demo",
+    "demo": "bikeped.lab.cli.demo",
     "config": "bikeped.cli.config",
     "doctor": "bikeped.cli.doctor",
     "align": "bikeped.cli.align",
-    "calibrate": "bikeped.cli.calibrate",
-    "conformance": "bikeped.cli.conformance",
-    "testbench": "bikeped.cli.testbench",
-    "scene": "bikeped.cli.scene",
-    "model": "bikeped.cli.model",
+    "calibrate": "bikeped.lab.cli.calibrate",
+    "conformance": "bikeped.lab.cli.conformance",
+    "testbench": "bikeped.lab.cli.testbench",
+    "scene": "bikeped.lab.cli.scene",
+    "model": "bikeped.lab.cli.model",
 }
 
 

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from shared_inputs import SHARED, missing
 
-from bikeped.cli.calibrate_tables import in_part
 from bikeped.cli.main import main
 from bikeped.config import ground_camera, load_config
 from bikeped.geometry import Lens
@@ -23,6 +22,7 @@ from bikeped.lab.calibration.board_render import Look, draw_picture
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.lab.calibration.solver.lens_model import Sightings
 from bikeped.lab.calibration.synthetic import BoardPose, DrawnCamera, spread_poses, turn
+from bikeped.lab.cli.calibrate_tables import in_part
 
 PATTERN = BoardPattern(8, 6, 0.1)
 REAL = SHARED / "media" / "fisheye-checkerboard"

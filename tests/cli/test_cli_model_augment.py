@@ -79,7 +79,7 @@ def test_bad_input_is_one_line_and_status_2(file, tmp_path, monkeypatch, capsys,
 
 
 def test_the_help_tells_the_defaults_of_the_code():
-    from bikeped.cli.model_augment import command
+    from bikeped.lab.cli.model_augment import command
     from bikeped.lab.training.augment import AugmentSettings
     from bikeped.lab.training.warp import WarpRanges
 

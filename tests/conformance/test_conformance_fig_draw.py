@@ -7,9 +7,9 @@ import click
 import numpy as np
 import pytest
 
-from bikeped.cli import conformance_governance as governance
 from bikeped.config import DecisionConfig, load_config
 from bikeped.errors import BikepedError
+from bikeped.lab.cli import conformance_governance as governance
 from bikeped.lab.experiments.figures import FIGURES, draw_all
 from bikeped.lab.experiments.scenario_plan import draw_plan
 from bikeped.lab.experiments.strip_chart import draw_strip, onsets, spans

@@ -7,9 +7,9 @@ import click
 import numpy as np
 import pytest
 
-from bikeped.cli import conformance_governance as governance
 from bikeped.config import DecisionConfig, load_config
 from bikeped.errors import BikepedError
+from bikeped.lab.cli import conformance_governance as governance
 from bikeped.lab.governance import register
 from bikeped.lab.governance.audit_records import write_audit
 from bikeped.lab.governance.contest import apply_bounds, contest, parse_truth, with_scenarios

@@ -9,11 +9,11 @@ import click
 import pytest
 import yaml
 
-from bikeped.cli import conformance_governance as governance
 from bikeped.config import DecisionConfig, load_config
 from bikeped.config.candidate import parse_decision
 from bikeped.config.provenance import check_provenance, decision_hash
 from bikeped.errors import BikepedError, ConfigError
+from bikeped.lab.cli import conformance_governance as governance
 from bikeped.lab.governance import promote as promoting
 from bikeped.lab.governance.gates import all_hold, check, check_figures
 from bikeped.lab.scenarios.scenario import load_scenarios

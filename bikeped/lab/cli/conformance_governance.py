@@ -17,13 +17,13 @@ from bikeped.cli.common import (
     progress_bar,
     write_json,
 )
-from bikeped.cli.conformance_shared import load_suite, scenarios_option
-from bikeped.cli.governance_tables import count, print_contest, print_gates, print_register
 from bikeped.cli.guard import guarded
 from bikeped.config import load_config
 from bikeped.config.candidate import load_decision
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.files import make_folder, write_whole
+from bikeped.lab.cli.conformance_shared import load_suite, scenarios_option
+from bikeped.lab.cli.governance_tables import count, print_contest, print_gates, print_register
 
 if TYPE_CHECKING:
     pass

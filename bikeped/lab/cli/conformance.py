@@ -13,9 +13,14 @@ from bikeped.cli.common import (
     progress_bar,
     write_json,
 )
-from bikeped.cli.conformance_governance import add_commands
-from bikeped.cli.conformance_pixels import command as pixels
-from bikeped.cli.conformance_shared import (
+from bikeped.cli.guard import guarded
+from bikeped.config.candidate import load_decision
+from bikeped.cores import cores
+from bikeped.errors import BikepedError
+from bikeped.files import write_whole
+from bikeped.lab.cli.conformance_governance import add_commands
+from bikeped.lab.cli.conformance_pixels import command as pixels
+from bikeped.lab.cli.conformance_shared import (
     begin,
     burst_option,
     curve_option,
@@ -27,11 +32,6 @@ from bikeped.cli.conformance_shared import (
     suite_options,
     trials_option,
 )
-from bikeped.cli.guard import guarded
-from bikeped.config.candidate import load_decision
-from bikeped.cores import cores
-from bikeped.errors import BikepedError
-from bikeped.files import write_whole
 
 if TYPE_CHECKING:
     pass

@@ -11,12 +11,12 @@ import click
 from rich.markup import escape
 
 from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
-from bikeped.cli.conformance_shared import scenarios_option
-from bikeped.cli.governance_tables import print_contest
 from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
+from bikeped.lab.cli.conformance_shared import scenarios_option
+from bikeped.lab.cli.governance_tables import print_contest
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 
 if TYPE_CHECKING:

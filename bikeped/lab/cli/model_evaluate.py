@@ -15,10 +15,10 @@ from bikeped.cli.common import (
     progress_bar,
     write_json,
 )
-from bikeped.cli.conformance_shared import print_table
 from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
+from bikeped.lab.cli.conformance_shared import print_table
 
 if TYPE_CHECKING:
     from bikeped.lab.result_tables import Cell, Table

@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bikeped.cli.calibrate_run import Done
 from bikeped.lab.calibration.solver.compare import paper_criterion
 from bikeped.lab.calibration.solver.lens_fit import Fit
 from bikeped.lab.calibration.solver.lens_model import Sightings
+from bikeped.lab.cli.calibrate_run import Done
 
 _MOST_NAMED = 8
 

@@ -10,13 +10,13 @@ from rich.console import Console
 from rich.markup import escape
 
 from bikeped.capture import open_source
-from bikeped.cli.calibrate_run import camera_config
 from bikeped.errors import BikepedError
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.capture.board_pdf import write_board_pdf
 from bikeped.lab.calibration.capture.guide import Guide
 from bikeped.lab.calibration.capture.live_page import LivePage
 from bikeped.lab.calibration.capture.live_session import LiveSession, assumed_lens, capture_boards
+from bikeped.lab.cli.calibrate_run import camera_config
 
 DEFAULT_FOLDER = Path("calibration-pictures")
 

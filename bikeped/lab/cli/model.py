@@ -8,10 +8,10 @@ import click
 
 #: Command: module that holds it as `command`, imported only when asked for.
 COMMANDS = {
-    "augment": "bikeped.cli.model_augment",
-    "train": "bikeped.cli.model_train",
-    "export": "bikeped.cli.model_export",
-    "evaluate": "bikeped.cli.model_evaluate",
+    "augment": "bikeped.lab.cli.model_augment",
+    "train": "bikeped.lab.cli.model_train",
+    "export": "bikeped.lab.cli.model_export",
+    "evaluate": "bikeped.lab.cli.model_evaluate",
 }
 
 

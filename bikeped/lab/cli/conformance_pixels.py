@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 
 from bikeped.cli.common import console, progress_bar, width_height
-from bikeped.cli.conformance_shared import begin, emit, processes_option, suite_options
 from bikeped.cli.guard import guarded
 from bikeped.cores import cores
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder
+from bikeped.lab.cli.conformance_shared import begin, emit, processes_option, suite_options
 
 
 def _size(text: str) -> tuple[int, int]:

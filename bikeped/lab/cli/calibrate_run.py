@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.cli.calibrate_options import Asked
 from bikeped.cli.common import progress_bar, write_json
 from bikeped.config import LoadedConfig, framing, load_config
 from bikeped.errors import BikepedError
@@ -37,6 +36,7 @@ from bikeped.lab.calibration.solver.image_circle import brightest, circle_radius
 from bikeped.lab.calibration.solver.lens_fit import Fit
 from bikeped.lab.calibration.solver.lens_model import Model
 from bikeped.lab.calibration.solver.observations import cropped, prepare
+from bikeped.lab.cli.calibrate_options import Asked
 
 _CIRCLE_PICTURES = 16
 

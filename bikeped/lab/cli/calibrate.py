@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
-from bikeped.cli.calibrate_options import PATTERN, Asked
 from bikeped.cli.common import FiniteRange, config_options, console, json_option
 from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.errors import BikepedError
+from bikeped.lab.cli.calibrate_options import PATTERN, Asked
 
 _MODELS = ("equidistant", "equisolid", "stereographic", "orthographic", "linear", "equalarea")
 _DEFAULT_OUT = Path("camera_calibration.json")
@@ -112,9 +112,9 @@ def command(
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     try:
-        from bikeped.cli.calibrate_capture import live_pictures, write_board
-        from bikeped.cli.calibrate_run import run
-        from bikeped.cli.calibrate_tables import print_result
+        from bikeped.lab.cli.calibrate_capture import live_pictures, write_board
+        from bikeped.lab.cli.calibrate_run import run
+        from bikeped.lab.cli.calibrate_tables import print_result
     except ModuleNotFoundError as error:
         if str(error.name).startswith("bikeped"):
             raise
