@@ -10,7 +10,7 @@ import numpy as np
 from bikeped.detection.base import DetectorAnswer
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.rendering.clip import read_sidecar
-from bikeped.service.vision import Picture
+from bikeped.pipeline.detection_stage import Picture
 from bikeped.types import Detections
 
 

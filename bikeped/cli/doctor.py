@@ -15,7 +15,7 @@ from bikeped.config import default_config_path, load_config
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
-    from bikeped.service.doctor import Finding
+    from bikeped.pipeline.doctor import Finding
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skipped": "dim"}
 
@@ -34,7 +34,7 @@ def command(
     json_path: str | None,
 ) -> int:
     """Check camera, model, light, speaker, broker, clock and disk; 1 when one of them fails."""
-    from bikeped.service.doctor import Finding, checks, examine
+    from bikeped.pipeline.doctor import Finding, checks, examine
 
     file = config_path or default_config_path()
     findings: list[Finding] = []

@@ -22,7 +22,7 @@ from bikeped.config import load_config
 from bikeped.files import make_folder
 
 if TYPE_CHECKING:
-    from bikeped.service.replay import ReplayResult
+    from bikeped.pipeline.replay import ReplayResult
 
 
 @click.command("replay")
@@ -53,7 +53,7 @@ def command(
     json_path: str | None,
 ) -> int:
     """Run VIDEO (a file or a folder of pictures) through the loop and say what it decided."""
-    from bikeped.service.replay import ReplayFiles, replay
+    from bikeped.pipeline.replay import ReplayFiles, replay
 
     if web_place is not None:
         overrides += web_overrides(web_place)

@@ -19,7 +19,7 @@ from bikeped.config import load_config
 @config_options
 def command(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
     """Watch the crossing until told to stop (SIGTERM): the service."""
-    from bikeped.service.run import run_service
+    from bikeped.pipeline.run import run_service
 
     root = logging.getLogger()
     root.setLevel(min(root.level, logging.INFO))

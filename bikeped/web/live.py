@@ -18,7 +18,7 @@ import msgspec
 from aiohttp import hdrs, web
 
 from bikeped.config import WebConfig
-from bikeped.service.pages import Inside
+from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.latency import STAGES
 from bikeped.web.painter import Painter
 from bikeped.web.server import Page, add_page

@@ -7,9 +7,9 @@ from functools import partial
 from aiohttp import web
 
 from bikeped.config import LoadedConfig
-from bikeped.service.loop import Outcome
-from bikeped.service.pages import Inside
-from bikeped.service.telemetry import as_mapping
+from bikeped.pipeline.loop import Outcome
+from bikeped.pipeline.telemetry import as_mapping
+from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.http import add_monitoring
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 import msgspec
 import numpy as np
 
-from bikeped.service.loop import Outcome
+from bikeped.pipeline.loop import Outcome
 from bikeped.telemetry.latency import STAGES
 from bikeped.types import Decision, Kind, PairNumbers, Signal, State
 

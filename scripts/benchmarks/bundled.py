@@ -23,7 +23,7 @@ def run(figures: Figures) -> None:
     from bikeped.lab.rendering.clip import encode_jpeg
     from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
     from bikeped.models import BUNDLED_FILE
-    from bikeped.service.replay import replay
+    from bikeped.pipeline.replay import replay
 
     # As `bikeped replay` has it: two copies of the model share the cores.
     loaded = load_config(None, ("detection.model=bundled", "detection.providers=[cpu]"))

@@ -24,7 +24,7 @@ def run(figures: Figures) -> None:
     from benchmarks.pictures import street_4k
     from bikeped.config import load_config
     from bikeped.lab.rendering.avi_writer import AviWriter
-    from bikeped.service.replay import replay
+    from bikeped.pipeline.replay import replay
 
     pictures = street_4k(DISTINCT)
     with tempfile.TemporaryDirectory() as folder:

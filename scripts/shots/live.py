@@ -17,7 +17,7 @@ from bikeped.detection.base import DetectorAnswer
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import read_sidecar, sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import parse_scenario
-from bikeped.service.replay import replay
+from bikeped.pipeline.replay import replay
 from bikeped.types import Detections
 from bikeped.web.service import ServicePages
 

@@ -33,7 +33,7 @@ from bikeped.lab.calibration.solver.lens_model import Model
 from bikeped.lab.calibration.solver.observations import prepare
 from bikeped.lab.calibration.solver.outliers import LeftOut
 from bikeped.lab.simulation.suite import Suite
-from bikeped.service.viewpoint import Viewpoint
+from bikeped.pipeline.ground_mapper import Viewpoint
 
 FRAMING = Framing(3840, 2160, 3840, 3500)
 K = (0.01, -0.012, 0.004, -0.0007)

@@ -11,8 +11,8 @@ import jsonschema
 import pytest
 
 from bikeped.cli.main import main
-from bikeped.service import doctor as checks
-from bikeped.service.doctor import Check, Finding
+from bikeped.pipeline import doctor as checks
+from bikeped.pipeline.doctor import Check, Finding
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
 

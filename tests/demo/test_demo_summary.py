@@ -8,7 +8,7 @@ from bikeped.config import load_config
 from bikeped.lab.demo import bundled_scenario, format_summary, summarise
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import load_scenario
-from bikeped.service.judge import Judge
+from bikeped.pipeline.track_and_decide import Judge
 
 CONFIG = Path(__file__).parents[2] / "config.yaml"
 

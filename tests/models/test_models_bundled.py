@@ -22,7 +22,7 @@ from bikeped.models import (
     NOT_FOR_STREETS,
     model_file,
 )
-from bikeped.service.doctor import check_model
+from bikeped.pipeline.doctor import check_model
 from bikeped.types import Kind
 
 

@@ -78,7 +78,7 @@ def test_the_loop_and_the_ladder_decide_alike(
 ) -> None:
     """The last rung comes out of the loop, the others out of its judge: same boxes, same states."""
     from bikeped.lab.endtoend.ablation import _judge_boxes
-    from bikeped.service.judge import Judge
+    from bikeped.pipeline.track_and_decide import Judge
 
     judge = Judge(loaded, riders_whole=run.riders_whole)
     again = _judge_boxes(judge, run, lambda r, f: r.detections[f])

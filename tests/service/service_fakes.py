@@ -11,10 +11,10 @@ import numpy as np
 from bikeped.config import LoadedConfig, parse_config
 from bikeped.detection.base import DetectorAnswer
 from bikeped.feedback import SignalLogic
-from bikeped.service.announcer import Announcer
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Limits, Loop, Outcome
-from bikeped.service.vision import Picture, Vision
+from bikeped.pipeline.detection_stage import Picture, Vision
+from bikeped.pipeline.loop import Limits, Loop, Outcome
+from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.track_and_decide import Judge
 from bikeped.types import Decision, Detections, Frame, Kind, Signal
 
 PATIENCE_S = 20.0  # reached only by a failure

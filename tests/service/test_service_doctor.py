@@ -10,8 +10,8 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.errors import CaptureError, FeedbackError
-from bikeped.service import doctor
-from bikeped.service.doctor import Check, Finding, checks, examine
+from bikeped.pipeline import doctor
+from bikeped.pipeline.doctor import Check, Finding, checks, examine
 from bikeped.types import Colour, Frame
 
 PATIENCE_S = 20.0

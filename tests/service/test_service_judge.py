@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bikeped.config import load_config
-from bikeped.service.judge import Judge
+from bikeped.pipeline.track_and_decide import Judge
 from bikeped.types import Detections, Kind, State
 
 P, C = Kind.PEDESTRIAN, Kind.CYCLIST

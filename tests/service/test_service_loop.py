@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from service_fakes import PATIENCE_S, FakeEye, Rig, seen, small
 
-import bikeped.service.loop as loop_module
+import bikeped.pipeline.loop as loop_module
 from bikeped.detection.base import DetectorAnswer
 from bikeped.errors import CaptureError, DetectorError, GeometryError
-from bikeped.service.loop import RESTART_AFTER_S, Hung, Limits, Outcome
-from bikeped.service.slot import Slot
-from bikeped.service.vision import Picture
+from bikeped.pipeline.detection_stage import Picture
+from bikeped.pipeline.latest_frame_slot import Slot
+from bikeped.pipeline.loop import RESTART_AFTER_S, Hung, Limits, Outcome
 from bikeped.types import Colour, Kind
 
 REASSURING = {Colour.BLUE, Colour.GREEN}

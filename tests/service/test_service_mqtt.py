@@ -14,7 +14,7 @@ from service_fakes import PATIENCE_S, FakeEye, seen
 
 from bikeped.capture import FrameSource
 from bikeped.config import load_config
-from bikeped.service.replay import ReplayFiles, replay
+from bikeped.pipeline.replay import ReplayFiles, replay
 from bikeped.types import Frame, Kind
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
@@ -73,7 +73,7 @@ async def test_a_broker_killed_in_mid_replay_costs_messages_and_no_time(
 ):
     broker = make_broker()
     source = Endless(small_jpegs)
-    monkeypatch.setattr("bikeped.service.replay.open_source", lambda *a, **k: source)
+    monkeypatch.setattr("bikeped.pipeline.replay.open_source", lambda *a, **k: source)
     config = small_config(
         more=f"  # of mqtt\n  enabled: true\n  host: 127.0.0.1\n  port: {broker.port}\n"
         "  site: kill\n"

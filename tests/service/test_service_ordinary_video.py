@@ -14,7 +14,7 @@ import pytest
 from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config import load_config
-from bikeped.service.replay import ReplayFiles, replay
+from bikeped.pipeline.replay import ReplayFiles, replay
 from bikeped.telemetry.messages import decision_digest
 
 ROOT = Path(__file__).parents[2]

@@ -14,11 +14,11 @@ from service_fakes import PATIENCE_S, Clock, FakeEye
 
 from bikeped.capture import FrameGrabber, open_source
 from bikeped.errors import CaptureError
-from bikeped.service.feed import LiveFeed, RecordedFeed
-from bikeped.service.seldom import Seldom
-from bikeped.service.systemd import Notifier
-from bikeped.service.vision import Vision
-from bikeped.service.workers import Worker
+from bikeped.pipeline.detection_stage import Vision
+from bikeped.pipeline.feed import LiveFeed, RecordedFeed
+from bikeped.pipeline.rate_limited_log import Seldom
+from bikeped.pipeline.systemd import Notifier
+from bikeped.pipeline.worker_threads import Worker
 from bikeped.types import Frame
 
 

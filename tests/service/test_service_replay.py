@@ -13,7 +13,7 @@ from service_fakes import FakeEye, seen
 
 from bikeped.config import load_config
 from bikeped.errors import BikepedError, CaptureError, GeometryError, TelemetryError
-from bikeped.service.replay import ReplayFiles, replay
+from bikeped.pipeline.replay import ReplayFiles, replay
 from bikeped.telemetry.messages import decision_digest, decision_view, parse_event
 from bikeped.types import Detections, Kind
 
@@ -170,7 +170,7 @@ def test_a_camera_is_no_recording(small_config, monkeypatch):
         def close(self):
             pass
 
-    monkeypatch.setattr("bikeped.service.replay.open_source", lambda *a, **k: Camera())
+    monkeypatch.setattr("bikeped.pipeline.replay.open_source", lambda *a, **k: Camera())
     with pytest.raises(BikepedError, match="bikeped run"):
         replay(load_config(small_config()), "/dev/video0", eye=FakeEye())
 

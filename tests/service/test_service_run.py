@@ -175,7 +175,7 @@ import sys, threading
 from bikeped.cli.main import main
 from bikeped.detection.base import DetectorAnswer
 from bikeped.types import Detections
-import bikeped.service.run as run
+import bikeped.pipeline.run as run
 
 class Eye:
     name, model_hash, riders_whole, looks = "hangs", None, False, 0
@@ -208,7 +208,7 @@ def test_a_hung_detector_is_a_fault_and_then_a_fresh_process(start, make_clip, s
 LOADS_FOR_EVER = """
 import sys, threading
 from bikeped.cli.main import main
-import bikeped.service.run as run
+import bikeped.pipeline.run as run
 run.load_eye = lambda loaded: threading.Event().wait()
 sys.exit(main(sys.argv[1:]))
 """

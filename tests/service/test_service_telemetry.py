@@ -11,9 +11,9 @@ from prometheus_client import generate_latest
 from service_fakes import Clock, Rig, seen, small
 
 from bikeped.feedback import SignalLogic
-from bikeped.service.announcer import Announcer
-from bikeped.service.health import health_line, tell_health
-from bikeped.service.telemetry import Telemetry
+from bikeped.pipeline.health_report import health_line, tell_health
+from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.telemetry import Telemetry
 from bikeped.telemetry.messages import Part, encode
 from bikeped.telemetry.metrics import Metrics
 from bikeped.types import Kind

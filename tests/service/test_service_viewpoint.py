@@ -5,7 +5,7 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.errors import GeometryError
-from bikeped.service.viewpoint import Viewpoint
+from bikeped.pipeline.ground_mapper import Viewpoint
 from bikeped.types import Detections, Kind
 
 

@@ -21,7 +21,7 @@ from bikeped.config import load_config
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
-from bikeped.service.replay import ReplayFiles, ReplayResult, replay
+from bikeped.pipeline.replay import ReplayFiles, ReplayResult, replay
 from bikeped.telemetry.messages import parse_event
 from bikeped.web.live import Live, add_live
 from bikeped.web.server import make_pages

@@ -10,10 +10,10 @@ import simplejpeg
 from prometheus_client import CollectorRegistry
 
 from bikeped.config import LoadedConfig, parse_config
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Outcome
-from bikeped.service.pages import Inside
-from bikeped.service.vision import Picture
+from bikeped.pipeline.detection_stage import Picture
+from bikeped.pipeline.loop import Outcome
+from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.messages import Counters, HealthMessage, Part, health_message
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.types import Colour, Detections, Frame, Kind, Signal

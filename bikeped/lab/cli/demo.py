@@ -58,7 +58,7 @@ def command(
     from bikeped.lab.rendering.clip import frame_times, write_clip
     from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.models import BUNDLED, NOT_FOR_STREETS
-    from bikeped.service.replay import ReplayFiles, replay
+    from bikeped.pipeline.replay import ReplayFiles, replay
     from bikeped.telemetry.http import port_error
 
     if web_place is not None:

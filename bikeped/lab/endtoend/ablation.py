@@ -20,7 +20,7 @@ from bikeped.lab.simulation.metrics import Metrics, measure
 from bikeped.lab.simulation.perception import Seen
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.suite import Suite
-from bikeped.service.judge import Judge
+from bikeped.pipeline.track_and_decide import Judge
 from bikeped.types import Detections, GroundPoints
 
 States = npt.NDArray[np.int8]

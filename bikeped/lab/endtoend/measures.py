@@ -12,7 +12,7 @@ from bikeped.config import LoadedConfig
 from bikeped.lab.endtoend.matching import MIN_VISIBLE, match
 from bikeped.lab.endtoend.run import PixelRun
 from bikeped.lab.simulation.perception import Seen
-from bikeped.service.viewpoint import Viewpoint
+from bikeped.pipeline.ground_mapper import Viewpoint
 from bikeped.types import Detections, FloatArray, Kind
 
 #: Bounds of the distance rings, metres from the camera.

@@ -16,12 +16,12 @@ from bikeped.lab.process_pool import workers
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
-from bikeped.service.announcer import Announcer
-from bikeped.service.feed import RecordedFeed
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Loop, Outcome
-from bikeped.service.parts import load_eye
-from bikeped.service.vision import Eye, Vision
+from bikeped.pipeline.detection_stage import Eye, Vision
+from bikeped.pipeline.factory import load_eye
+from bikeped.pipeline.feed import RecordedFeed
+from bikeped.pipeline.loop import Loop, Outcome
+from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.track_and_decide import Judge
 from bikeped.types import Detections
 
 

@@ -12,8 +12,8 @@ import msgspec
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Loop, Outcome
+from bikeped.pipeline.loop import Loop, Outcome
+from bikeped.pipeline.track_and_decide import Judge
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.messages import (

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from bikeped.capture import FrameGrabber, FrameSource
-from bikeped.service.workers import Worker
+from bikeped.pipeline.worker_threads import Worker
 from bikeped.types import Frame
 
 

@@ -16,17 +16,17 @@ from bikeped.capture import FrameSource, Paced, open_source
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback import LightDriver, SignalLogic, SimulatedLight
-from bikeped.service.announcer import Announcer
-from bikeped.service.feed import RecordedFeed
-from bikeped.service.health import tell_health
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Loop, Output
-from bikeped.service.pages import Inside, Pages, open_pages
-from bikeped.service.parts import header_of, load_eye, start_publisher
-from bikeped.service.recording import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
-from bikeped.service.telemetry import Telemetry
-from bikeped.service.viewpoint import Viewpoint
-from bikeped.service.vision import Eye, ModelEye, Vision
+from bikeped.pipeline.detection_stage import Eye, ModelEye, Vision
+from bikeped.pipeline.factory import header_of, load_eye, start_publisher
+from bikeped.pipeline.feed import RecordedFeed
+from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.health_report import tell_health
+from bikeped.pipeline.loop import Loop, Output
+from bikeped.pipeline.replay_outputs import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
+from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.telemetry import Telemetry
+from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.web_context import Inside, Pages, open_pages
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.messages import HealthMessage, Part
 from bikeped.telemetry.metrics import Metrics

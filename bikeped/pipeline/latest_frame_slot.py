@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Coroutine
 from typing import Any
 
-from bikeped.service.vision import Picture
+from bikeped.pipeline.detection_stage import Picture
 
 
 class Slot:

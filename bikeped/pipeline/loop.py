@@ -26,13 +26,13 @@ from typing import Protocol
 from bikeped.detection.base import DetectorAnswer
 from bikeped.errors import BikepedError, CaptureError, GeometryError
 from bikeped.feedback import assess
-from bikeped.service.announcer import Announcer
-from bikeped.service.feed import Feed
-from bikeped.service.judge import Judge, Judgement
-from bikeped.service.seldom import Seldom
-from bikeped.service.slot import Slot, first_of
-from bikeped.service.vision import Picture, Vision
-from bikeped.service.workers import Worker
+from bikeped.pipeline.detection_stage import Picture, Vision
+from bikeped.pipeline.feed import Feed
+from bikeped.pipeline.latest_frame_slot import Slot, first_of
+from bikeped.pipeline.rate_limited_log import Seldom
+from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.track_and_decide import Judge, Judgement
+from bikeped.pipeline.worker_threads import Worker
 from bikeped.types import Detections, Frame, Signal
 
 log = logging.getLogger(__name__)

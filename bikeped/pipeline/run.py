@@ -17,18 +17,18 @@ from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_driver, open_speaker
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
-from bikeped.service.announcer import Announcer
-from bikeped.service.feed import LiveFeed
-from bikeped.service.health import tell_health
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Hung, Limits, Loop
-from bikeped.service.pages import Inside, Pages, open_pages
-from bikeped.service.parts import header_of, load_eye, start_publisher
-from bikeped.service.systemd import Notifier
-from bikeped.service.telemetry import Telemetry
-from bikeped.service.viewpoint import Viewpoint
-from bikeped.service.vision import Eye, Vision
-from bikeped.service.workers import Worker
+from bikeped.pipeline.detection_stage import Eye, Vision
+from bikeped.pipeline.factory import header_of, load_eye, start_publisher
+from bikeped.pipeline.feed import LiveFeed
+from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.health_report import tell_health
+from bikeped.pipeline.loop import Hung, Limits, Loop
+from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.systemd import Notifier
+from bikeped.pipeline.telemetry import Telemetry
+from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.web_context import Inside, Pages, open_pages
+from bikeped.pipeline.worker_threads import Worker
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.messages import HealthMessage, Part
 from bikeped.telemetry.metrics import Metrics

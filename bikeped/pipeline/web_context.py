@@ -11,9 +11,9 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 
 from bikeped.config import LoadedConfig, WebConfig
-from bikeped.service.announcer import SignalListener
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Output
+from bikeped.pipeline.loop import Output
+from bikeped.pipeline.signal_dispatcher import SignalListener
+from bikeped.pipeline.track_and_decide import Judge
 from bikeped.telemetry.http import HttpServer
 from bikeped.telemetry.messages import HealthMessage
 from bikeped.telemetry.mqtt import MqttStatus

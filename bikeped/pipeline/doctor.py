@@ -32,9 +32,9 @@ from bikeped.feedback import open_light
 from bikeped.feedback.light import LAMP_COLOURS
 from bikeped.feedback.sounds import make_wav
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
-from bikeped.service.parts import load_eye
-from bikeped.service.viewpoint import Viewpoint
-from bikeped.service.vision import Picture
+from bikeped.pipeline.detection_stage import Picture
+from bikeped.pipeline.factory import load_eye
+from bikeped.pipeline.ground_mapper import Viewpoint
 from bikeped.telemetry.mqtt_auth import load_credentials
 from bikeped.types import Frame, Sound
 

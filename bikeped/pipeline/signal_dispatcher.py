@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from bikeped.feedback import OFF, LightDriver, SignalLogic, Speaker
-from bikeped.service.seldom import Seldom
+from bikeped.pipeline.rate_limited_log import Seldom
 from bikeped.types import Decision, Signal
 
 log = logging.getLogger(__name__)

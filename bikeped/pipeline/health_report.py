@@ -8,9 +8,9 @@ import math
 import time
 from collections.abc import Callable, Mapping
 
-from bikeped.service.loop import Loop
-from bikeped.service.seldom import Seldom
-from bikeped.service.telemetry import Telemetry
+from bikeped.pipeline.loop import Loop
+from bikeped.pipeline.rate_limited_log import Seldom
+from bikeped.pipeline.telemetry import Telemetry
 from bikeped.telemetry.messages import HealthMessage
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from bikeped.config import LoadedConfig, rule_settings, tracker_settings
 from bikeped.decision import Decider
-from bikeped.service.viewpoint import Viewpoint
+from bikeped.pipeline.ground_mapper import Viewpoint
 from bikeped.tracking import Tracker, predict
 from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 

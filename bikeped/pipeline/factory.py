@@ -12,7 +12,7 @@ from bikeped.config import DetectionConfig, LoadedConfig, road_region
 from bikeped.cores import cores
 from bikeped.detection.load import load_detector
 from bikeped.errors import DetectorError
-from bikeped.service.vision import MOST_LOOKS, Eye, ModelEye
+from bikeped.pipeline.detection_stage import MOST_LOOKS, Eye, ModelEye
 from bikeped.telemetry.messages import EventHeader, event_header
 from bikeped.telemetry.mqtt import MqttPublisher
 

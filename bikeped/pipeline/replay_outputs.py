@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.service.judge import Judge
-from bikeped.service.loop import Outcome
-from bikeped.service.telemetry import line_of
+from bikeped.pipeline.loop import Outcome
+from bikeped.pipeline.telemetry import line_of
+from bikeped.pipeline.track_and_decide import Judge
 from bikeped.telemetry.events import EventWriter
 from bikeped.telemetry.messages import EventHeader
 from bikeped.types import Kind, State
