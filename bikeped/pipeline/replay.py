@@ -16,6 +16,7 @@ from bikeped.capture import FrameSource, Paced, open_source
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback import LightDriver, SignalLogic, SimulatedLight
+from bikeped.overlay import VideoSink
 from bikeped.pipeline.detection_stage import Eye, ModelEye, Vision
 from bikeped.pipeline.factory import header_of, load_eye, start_publisher
 from bikeped.pipeline.feed import RecordedFeed
@@ -30,7 +31,6 @@ from bikeped.pipeline.web_context import Inside, Pages, open_pages
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.messages import HealthMessage, Part
 from bikeped.telemetry.metrics import Metrics
-from bikeped.view import VideoSink
 
 log = logging.getLogger(__name__)
 

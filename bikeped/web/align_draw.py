@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from bikeped.overlay.drawing import INK, Rgb, draw_text, fill_rect, polyline, text_size
 from bikeped.types import ImageArray
-from bikeped.view.draw import INK, Rgb, draw_text, fill_rect, polyline, text_size
 from bikeped.web.align_grid import Grid
 
 #: Colour and width (in sixteen-hundredths of the picture's width) of each kind of line, in order.

@@ -19,12 +19,12 @@ import numpy as np
 
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.errors import CaptureError
+from bikeped.overlay import Moment, draw_overlay, encode_jpeg, ground_projector
 from bikeped.pipeline.loop import Outcome
 from bikeped.pipeline.rate_limited_log import Seldom
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.worker_threads import Worker
 from bikeped.types import FloatArray, ImageArray, Signal
-from bikeped.view import Moment, draw_overlay, encode_jpeg, ground_projector
 from bikeped.web.watch import Watch
 
 log = logging.getLogger(__name__)

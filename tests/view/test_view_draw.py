@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bikeped.view.draw import (
+from bikeped.overlay.drawing import (
     INK,
     KIND_COLOUR,
     PAPER,

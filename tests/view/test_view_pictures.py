@@ -6,6 +6,17 @@ import pytest
 
 from bikeped.errors import CaptureError
 from bikeped.geometry import Framing, GroundCamera, Lens
+from bikeped.overlay import (
+    Moment,
+    RadarFrame,
+    VideoSink,
+    compose,
+    draw_overlay,
+    draw_radar,
+    encode_jpeg,
+    ground_projector,
+)
+from bikeped.overlay.drawing import INK, KIND_COLOUR, SIGNAL_COLOUR
 from bikeped.types import (
     Colour,
     Decision,
@@ -16,17 +27,6 @@ from bikeped.types import (
     State,
     Tracks,
 )
-from bikeped.view import (
-    Moment,
-    RadarFrame,
-    VideoSink,
-    compose,
-    draw_overlay,
-    draw_radar,
-    encode_jpeg,
-    ground_projector,
-)
-from bikeped.view.draw import INK, KIND_COLOUR, SIGNAL_COLOUR
 
 GREY = np.full((432, 768, 3), 120, np.uint8)
 PAIR = PairNumbers(12, 7, 10.9, 11.2, 0.067, 0.28, 4.3, 1.9, 24.8)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bikeped.types import FloatArray, ImageArray, Kind
-from bikeped.view.draw import (
+from bikeped.overlay.drawing import (
     INK,
     KIND_COLOUR,
     PAPER,
@@ -25,7 +24,8 @@ from bikeped.view.draw import (
     text_size,
     wrap_text,
 )
-from bikeped.view.moment import GroundToFrame, Moment
+from bikeped.overlay.overlay_data import GroundToFrame, Moment
+from bikeped.types import FloatArray, ImageArray, Kind
 
 #: A coasting track is drawn as a ring of this radius lying on the ground.
 RING_M = 0.6

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import simplejpeg
 
+from bikeped.overlay.camera_view import draw_banner, draw_overlay
+from bikeped.overlay.drawing import INK
+from bikeped.overlay.overlay_data import GroundToFrame, Moment
+from bikeped.overlay.radar import draw_radar
 from bikeped.types import ImageArray
-from bikeped.view.draw import INK
-from bikeped.view.moment import GroundToFrame, Moment
-from bikeped.view.overlay import draw_banner, draw_overlay
-from bikeped.view.radar import draw_radar
 
 #: Share of the width that the camera's picture takes.
 _PICTURE = 0.705

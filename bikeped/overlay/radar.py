@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.types import FloatArray, ImageArray, Kind
-from bikeped.view.draw import (
+from bikeped.overlay.drawing import (
     KIND_COLOUR,
     PAPER,
     SIGNAL_COLOUR,
@@ -29,7 +28,8 @@ from bikeped.view.draw import (
     shade,
     text_size,
 )
-from bikeped.view.moment import Moment
+from bikeped.overlay.overlay_data import Moment
+from bikeped.types import FloatArray, ImageArray, Kind
 
 RING_STEP_M = 5.0
 #: An arrow shows where its object will be after this long.

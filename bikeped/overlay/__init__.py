@@ -3,11 +3,11 @@
 Pure functions over the stage types; only `VideoSink` touches the disk.
 """
 
-from bikeped.view.compose import compose, encode_jpeg
-from bikeped.view.moment import GroundToFrame, Moment, ground_projector
-from bikeped.view.overlay import draw_banner, draw_overlay
-from bikeped.view.radar import RadarFrame, draw_radar
-from bikeped.view.sink import VideoSink
+from bikeped.overlay.camera_view import draw_banner, draw_overlay
+from bikeped.overlay.compose import compose, encode_jpeg
+from bikeped.overlay.overlay_data import GroundToFrame, Moment, ground_projector
+from bikeped.overlay.radar import RadarFrame, draw_radar
+from bikeped.overlay.video_writer import VideoSink
 
 __all__ = [
     "GroundToFrame",
