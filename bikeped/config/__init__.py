@@ -7,7 +7,7 @@ from bikeped.config.build import (
     rule_settings,
     tracker_settings,
 )
-from bikeped.config.calibration import Calibration, load_calibration
+from bikeped.config.calibration_file import Calibration, load_calibration
 from bikeped.config.load import (
     LoadedConfig,
     config_hash,
@@ -16,9 +16,9 @@ from bikeped.config.load import (
     load_config,
     parse_config,
 )
-from bikeped.config.sections import CameraConfig, Config, DetectionConfig
-from bikeped.config.sections_judge import DecisionConfig, LatencyConfig, TrackingConfig
-from bikeped.config.sections_output import (
+from bikeped.config.schema.decision import DecisionConfig, LatencyConfig, TrackingConfig
+from bikeped.config.schema.inputs import CameraConfig, Config, DetectionConfig
+from bikeped.config.schema.outputs import (
     AuditConfig,
     FeedbackConfig,
     GpioConfig,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from bikeped.config.load import LoadedConfig
-from bikeped.config.sections_judge import DecisionConfig, TrackingConfig
+from bikeped.config.schema.decision import DecisionConfig, TrackingConfig
 from bikeped.decision import RuleSettings
 from bikeped.errors import ConfigError, GeometryError
 from bikeped.geometry import Framing, GroundCamera, Lens, canonical_projection

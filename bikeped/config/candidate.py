@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 
 from bikeped.config.load import _apply, _explain, _yaml_mapping
-from bikeped.config.sections import Config
-from bikeped.config.sections_judge import DecisionConfig
+from bikeped.config.schema.decision import DecisionConfig
+from bikeped.config.schema.inputs import Config
 from bikeped.errors import ConfigError
 
 _MAX_BYTES = 1_000_000

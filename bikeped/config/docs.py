@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from bikeped.config.sections import Config
+from bikeped.config.schema.inputs import Config
 from bikeped.files import write_whole
 
 _INTRO = """\

@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 import yaml
 
-from bikeped.config.calibration import Calibration, load_calibration
-from bikeped.config.sections import Config
-from bikeped.config.sections_output import is_loopback
+from bikeped.config.calibration_file import Calibration, load_calibration
+from bikeped.config.schema.inputs import Config
+from bikeped.config.schema.outputs import is_loopback
 from bikeped.errors import ConfigError
 from bikeped.models import BUNDLED
 

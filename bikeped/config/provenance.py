@@ -16,7 +16,7 @@ import msgspec
 from bikeped import __version__
 from bikeped.config.build import ground_camera
 from bikeped.config.load import LoadedConfig
-from bikeped.config.sections_judge import DecisionConfig
+from bikeped.config.schema.decision import DecisionConfig
 from bikeped.errors import BikepedError
 
 #: What turns positions into a state on the pole; the simulation runs the very same code.

@@ -11,7 +11,7 @@ from bikeped.errors import DetectorError
 from bikeped.types import Kind, KindArray
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import DetectionConfig
+    from bikeped.config.schema.inputs import DetectionConfig
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from bikeped.errors import DetectorError
 from bikeped.types import Region
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import DetectionConfig
+    from bikeped.config.schema.inputs import DetectionConfig
 
 _LONGEST_LITERAL = 1 << 20
 _DEFAULT_SIZE = 640  #: Ultralytics' default, where neither the shape nor the metadata names one

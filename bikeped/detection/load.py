@@ -12,7 +12,7 @@ from bikeped.models import model_file
 from bikeped.types import Region
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import DetectionConfig
+    from bikeped.config.schema.inputs import DetectionConfig
 
 
 def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None = None) -> Detector:

@@ -28,7 +28,7 @@ from bikeped.errors import DetectorError
 from bikeped.types import Detections, Float32Array, ImageArray, IntArray, Kind, KindArray, Region
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import DetectionConfig
+    from bikeped.config.schema.inputs import DetectionConfig
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from bikeped.errors import DetectorError
 from bikeped.types import Region
 
 if TYPE_CHECKING:
-    from bikeped.config.sections import DetectionConfig
+    from bikeped.config.schema.inputs import DetectionConfig
 
 _LARGEST_HEADER = 1 << 20
 #: TensorRT's DataType by name. Its own `nptype` is avoided: it touches np.bool in some releases.

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bikeped.config.sections import Config
+from bikeped.config.schema.inputs import Config
 from bikeped.feedback.light import DEADMAN
 from bikeped.feedback.signal import assess
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bikeped.config.sections import DetectionConfig
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.classes import COCO_NAMES, class_names, kind_table
 from bikeped.detection.facts import ModelMetadata, parse_metadata, resolve_input
 from bikeped.detection.hashing import checked_sha256, sha256_of

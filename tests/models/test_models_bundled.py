@@ -9,7 +9,7 @@ import pytest
 
 from bikeped.cli.main import main
 from bikeped.config import load_config, road_region
-from bikeped.config.sections import DetectionConfig
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.hashing import sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera

@@ -106,7 +106,7 @@ async def test_the_will_says_offline_when_the_client_is_cut_off(broker, listen, 
 async def test_the_will_says_offline_when_the_process_is_killed(broker, listen):
     program = (
         "import asyncio, sys\n"
-        "from bikeped.config.sections import MqttConfig\n"
+        "from bikeped.config.schema.inputs import MqttConfig\n"
         "from bikeped.telemetry.mqtt import MqttPublisher\n"
         "async def main():\n"
         "    mqtt = MqttPublisher(MqttConfig(port=int(sys.argv[1]), site='killed'))\n"

@@ -11,7 +11,7 @@ import pytest
 from coco_sets import CATEGORIES, annotation, edit, write_set
 from shared_inputs import CLIP, MODEL, missing
 
-from bikeped.config.sections import DetectionConfig
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.facts import ModelMetadata
 from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DataSetError, DetectorError

@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 
 from bikeped import __version__
-from bikeped.config.sections import DetectionConfig
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.layouts import Candidates
 from bikeped.detection.nms import suppress

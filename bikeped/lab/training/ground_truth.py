@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.config.sections import DetectionConfig
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.classes import WITH_RIDER
 from bikeped.detection.riders import join_riders
 from bikeped.lab.training.coco import CocoData, CocoImage, CocoObject

@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bikeped.config.sections import DetectionConfig
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.nms import overlap_matrix
 from bikeped.lab.training.coco import MISTAKEN, CocoData, CocoImage, furniture

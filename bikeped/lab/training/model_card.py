@@ -19,7 +19,7 @@ import numpy as np
 
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.config import LoadedConfig
-from bikeped.config.sections import DetectionConfig
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import Detector, load_detector
 from bikeped.geometry import road_region
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, pictures, scene_camera

@@ -13,9 +13,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from bikeped.config.section import Section
-from bikeped.config.sections_judge import DecisionConfig, LatencyConfig, TrackingConfig
-from bikeped.config.sections_output import (
+from bikeped.config.schema.base import Section
+from bikeped.config.schema.decision import DecisionConfig, LatencyConfig, TrackingConfig
+from bikeped.config.schema.outputs import (
     AuditConfig,
     FeedbackConfig,
     MqttConfig,

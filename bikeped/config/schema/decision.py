@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from bikeped.config.section import Section
+from bikeped.config.schema.base import Section
 
 
 class TrackingConfig(Section, frozen=True):

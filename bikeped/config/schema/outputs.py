@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from bikeped.config.section import Section
+from bikeped.config.schema.base import Section
 
 Ratio = Annotated[float, Meta(ge=0, le=1)]
 Line = Annotated[str, Meta(min_length=1)] | Annotated[int, Meta(ge=0, le=4095)]
