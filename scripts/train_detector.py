@@ -29,7 +29,7 @@ from bikeped import __version__
 from bikeped.config import LoadedConfig, load_config, road_region
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.detection.hashing import sha256_of
+from bikeped.detection.model_hash import sha256_of
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.rendering.random_scene import USUAL_MIX
 from bikeped.lab.training.augment import AugmentSettings, augment_data

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bikeped.detection.base import Detector
-from bikeped.detection.hashing import checked_sha256
+from bikeped.detection.model_hash import checked_sha256
 from bikeped.errors import DetectorError
 from bikeped.models import model_file
 from bikeped.types import Region

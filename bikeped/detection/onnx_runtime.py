@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from bikeped.detection.facts import (
+from bikeped.detection.detector import NetworkDetector
+from bikeped.detection.model_metadata import (
     ModelMetadata,
     choose_region,
     is_free,
     parse_metadata,
     resolve_input,
 )
-from bikeped.detection.pipeline import NetworkDetector
 from bikeped.errors import DetectorError
 from bikeped.types import Region
 

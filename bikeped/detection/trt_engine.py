@@ -21,8 +21,13 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.detection.cuda import Cuda
-from bikeped.detection.facts import ModelMetadata, choose_region, parse_metadata, resolve_input
-from bikeped.detection.pipeline import NetworkDetector
+from bikeped.detection.detector import NetworkDetector
+from bikeped.detection.model_metadata import (
+    ModelMetadata,
+    choose_region,
+    parse_metadata,
+    resolve_input,
+)
 from bikeped.errors import DetectorError
 from bikeped.types import Region
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.classes import COCO_NAMES, class_names, kind_table
-from bikeped.detection.facts import ModelMetadata, parse_metadata, resolve_input
-from bikeped.detection.hashing import checked_sha256, sha256_of
+from bikeped.detection.model_hash import checked_sha256, sha256_of
+from bikeped.detection.model_metadata import ModelMetadata, parse_metadata, resolve_input
 from bikeped.errors import DetectorError
 from bikeped.types import Kind
 

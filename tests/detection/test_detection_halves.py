@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bikeped.detection.halves import drop_halves
+from bikeped.detection.partial_persons import drop_halves
 from bikeped.types import Detections, Kind
 
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bikeped.detection.facts import ModelMetadata
-from bikeped.detection.layouts import (
+from bikeped.detection.model_metadata import ModelMetadata
+from bikeped.detection.output_layouts import (
     LAYOUTS,
     anchor_count,
     choose_layout,

@@ -12,8 +12,8 @@ from coco_sets import CATEGORIES, annotation, edit, write_set
 from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config.schema.inputs import DetectionConfig
-from bikeped.detection.facts import ModelMetadata
-from bikeped.detection.pipeline import NetworkDetector
+from bikeped.detection.detector import NetworkDetector
+from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.errors import DataSetError, DetectorError
 from bikeped.lab.rendering.dataset import write_dataset
 from bikeped.lab.simulation.perception import AREA_SCALE

@@ -7,8 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
-from bikeped.detection.facts import ModelMetadata  # noqa: E402
-from bikeped.detection.layouts import anchor_count, choose_layout, decode  # noqa: E402
+from bikeped.detection.model_metadata import ModelMetadata  # noqa: E402
+from bikeped.detection.output_layouts import anchor_count, choose_layout, decode  # noqa: E402
 from bikeped.lab.training.network import (  # noqa: E402
     STRIDES,
     Exported,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.detection.facts import parse_metadata
+from bikeped.detection.model_metadata import parse_metadata
 from bikeped.errors import DetectorError
 from bikeped.files import write_whole
 

@@ -32,9 +32,9 @@ import numpy as np
 from bikeped import __version__
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.detection.layouts import Candidates
+from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.nms import suppress
-from bikeped.detection.pipeline import NetworkDetector
+from bikeped.detection.output_layouts import Candidates
 from bikeped.errors import DataSetError
 from bikeped.files import write_whole
 from bikeped.lab.training.coco import CocoData, read_picture

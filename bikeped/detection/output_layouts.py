@@ -20,7 +20,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.detection.facts import ModelMetadata
+from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.errors import DetectorError
 from bikeped.types import BoolArray, Float32Array, IntArray
 

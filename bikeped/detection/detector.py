@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from bikeped.detection.base import DetectorAnswer
 from bikeped.detection.classes import UNMAPPED, class_names, kind_table, riders_are_whole
-from bikeped.detection.facts import ModelMetadata
-from bikeped.detection.halves import drop_halves
-from bikeped.detection.layouts import Candidates, Layout, choose_layout, decode, pick_output
+from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.detection.nms import merge, suppress
+from bikeped.detection.output_layouts import Candidates, Layout, choose_layout, decode, pick_output
+from bikeped.detection.partial_persons import drop_halves
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.detection.riders import join_riders
 from bikeped.detection.weights import first_layer
