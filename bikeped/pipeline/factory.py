@@ -13,7 +13,7 @@ from bikeped.cores import cores
 from bikeped.detection.load import load_detector
 from bikeped.errors import DetectorError
 from bikeped.pipeline.detection_stage import MOST_LOOKS, Eye, ModelEye
-from bikeped.telemetry.messages import EventHeader, event_header
+from bikeped.telemetry.builders import EventHeader, event_header
 from bikeped.telemetry.mqtt import MqttPublisher
 
 

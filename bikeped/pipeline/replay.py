@@ -28,8 +28,8 @@ from bikeped.pipeline.signal_dispatcher import Announcer
 from bikeped.pipeline.telemetry import Telemetry
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside, Pages, open_pages
+from bikeped.telemetry.builders import HealthMessage, Part
 from bikeped.telemetry.latency import StageTimes
-from bikeped.telemetry.messages import HealthMessage, Part
 from bikeped.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)

@@ -16,8 +16,8 @@ from bikeped.overlay import Moment, VideoSink, compose, ground_projector
 from bikeped.pipeline.loop import Outcome
 from bikeped.pipeline.telemetry import line_of
 from bikeped.pipeline.track_and_decide import Judge
+from bikeped.telemetry.builders import EventHeader
 from bikeped.telemetry.events import EventWriter
-from bikeped.telemetry.messages import EventHeader
 from bikeped.types import Kind, State
 
 OVERLAY_SIZE = (1600, 720)

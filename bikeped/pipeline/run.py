@@ -30,7 +30,7 @@ from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside, Pages, open_pages
 from bikeped.pipeline.worker_threads import Worker
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.messages import HealthMessage, Part
+from bikeped.telemetry.builders import HealthMessage, Part
 from bikeped.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)

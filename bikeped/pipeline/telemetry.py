@@ -15,8 +15,7 @@ from bikeped.config import LoadedConfig
 from bikeped.pipeline.loop import Loop, Outcome
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.latency import StageTimes
-from bikeped.telemetry.messages import (
+from bikeped.telemetry.builders import (
     Counters,
     EventLine,
     HealthMessage,
@@ -28,6 +27,7 @@ from bikeped.telemetry.messages import (
     state_message,
     tracks_message,
 )
+from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.mqtt import MqttPublisher
 from bikeped.types import Decision, Signal, State

@@ -14,8 +14,8 @@ from bikeped.config import LoadedConfig, WebConfig
 from bikeped.pipeline.loop import Output
 from bikeped.pipeline.signal_dispatcher import SignalListener
 from bikeped.pipeline.track_and_decide import Judge
-from bikeped.telemetry.http import HttpServer
-from bikeped.telemetry.messages import HealthMessage
+from bikeped.telemetry.builders import HealthMessage
+from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.mqtt import MqttStatus
 
 

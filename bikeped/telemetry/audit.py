@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from bikeped.config import AuditConfig
-from bikeped.telemetry.messages import EventHeader, EventLine, encode_line
+from bikeped.telemetry.builders import EventHeader, EventLine, encode_line
 
 log = logging.getLogger(__name__)
 

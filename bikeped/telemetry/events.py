@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 
 from bikeped.errors import TelemetryError
-from bikeped.telemetry.messages import EventHeader, EventLine, encode_line
+from bikeped.telemetry.builders import EventHeader, EventLine, encode_line
 
 
 class EventWriter:

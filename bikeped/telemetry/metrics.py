@@ -13,8 +13,8 @@ from typing import Any, get_args
 import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Enum, Gauge, Histogram
 
+from bikeped.telemetry.builders import ShownState
 from bikeped.telemetry.latency import STAGES
-from bikeped.telemetry.messages import ShownState
 from bikeped.types import Detections, Kind, Tracks
 
 #: Upper bounds in seconds: 0.5 ms (a pure stage) to 1 s (beyond any use); dense around a frame.

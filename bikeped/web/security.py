@@ -25,7 +25,7 @@ from aiohttp import hdrs, web
 
 from bikeped.config import WebConfig, is_loopback
 from bikeped.errors import ConfigError
-from bikeped.telemetry.http import host_name
+from bikeped.telemetry.http_server import host_name
 
 COOKIE = "bikeped_session"
 SESSION_S = 7 * 24 * 3600

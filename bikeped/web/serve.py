@@ -11,7 +11,7 @@ from aiohttp import web
 
 from bikeped.config import WebConfig
 from bikeped.errors import BikepedError
-from bikeped.telemetry.http import HttpServer
+from bikeped.telemetry.http_server import HttpServer
 from bikeped.web.security import open_access
 from bikeped.web.server import make_pages
 

@@ -10,7 +10,7 @@ from bikeped.config import LoadedConfig
 from bikeped.pipeline.loop import Outcome
 from bikeped.pipeline.telemetry import as_mapping
 from bikeped.pipeline.web_context import Inside
-from bikeped.telemetry.http import add_monitoring
+from bikeped.telemetry.http_server import add_monitoring
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align
 from bikeped.web.live import Live, add_live

@@ -98,7 +98,7 @@ class _Served:
     async def _run(self) -> None:
         from bikeped.config import WebConfig
         from bikeped.lab.testbench.pages import add_testbench
-        from bikeped.telemetry.http import HttpServer
+        from bikeped.telemetry.http_server import HttpServer
         from bikeped.web.security import open_access
         from bikeped.web.server import make_pages
 

@@ -15,7 +15,7 @@ from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config import load_config
 from bikeped.pipeline.replay import ReplayFiles, replay
-from bikeped.telemetry.messages import decision_digest
+from bikeped.telemetry.builders import decision_digest
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "docs" / "examples" / "ordinary-video.yaml"

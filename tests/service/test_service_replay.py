@@ -14,7 +14,7 @@ from service_fakes import FakeEye, seen
 from bikeped.config import load_config
 from bikeped.errors import BikepedError, CaptureError, GeometryError, TelemetryError
 from bikeped.pipeline.replay import ReplayFiles, replay
-from bikeped.telemetry.messages import decision_digest, decision_view, parse_event
+from bikeped.telemetry.builders import decision_digest, decision_view, parse_event
 from bikeped.types import Detections, Kind
 
 

@@ -14,7 +14,7 @@ from bikeped.feedback import SignalLogic
 from bikeped.pipeline.health_report import health_line, tell_health
 from bikeped.pipeline.signal_dispatcher import Announcer
 from bikeped.pipeline.telemetry import Telemetry
-from bikeped.telemetry.messages import Part, encode
+from bikeped.telemetry.builders import Part, encode
 from bikeped.telemetry.metrics import Metrics
 from bikeped.types import Kind
 

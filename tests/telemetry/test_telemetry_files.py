@@ -16,8 +16,8 @@ import pytest
 from bikeped.config import AuditConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.audit import AuditLog
+from bikeped.telemetry.builders import EventHeader, EventLine, event_header, event_line
 from bikeped.telemetry.events import EventWriter
-from bikeped.telemetry.messages import EventHeader, EventLine, event_header, event_line
 from bikeped.types import Decision, Detections, State, Tracks
 
 DEADLINE_S = 30.0

@@ -19,8 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.errors import TelemetryError
-from bikeped.telemetry import messages as m
-from bikeped.telemetry import schemas
+from bikeped.telemetry import builders as m
+from bikeped.telemetry import json_schema as schemas
 from bikeped.types import Decision, Detections, PairNumbers, State, Tracks
 
 DOCS = Path(__file__).parents[2] / "docs" / "messages"
@@ -322,14 +322,14 @@ def test_availability_follows_its_schema():
 def test_the_published_schemas_are_current():
     published = {p.name: p.read_text(encoding="utf-8") for p in DOCS.glob("*.schema.json")}
     assert published == schemas.schema_files(), (
-        "run python -m bikeped.telemetry.schemas docs/messages"
+        "run python -m bikeped.telemetry.json_schema docs/messages"
     )
 
 
 def test_the_schemas_command(tmp_path: Path):
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, "-m", "bikeped.telemetry.schemas", *arguments],
+            [sys.executable, "-m", "bikeped.telemetry.json_schema", *arguments],
             capture_output=True,
             text=True,
             check=False,

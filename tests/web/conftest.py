@@ -37,7 +37,7 @@ from playwright.sync_api import (
 from web_fakes import DESKTOP
 
 from bikeped.config import WebConfig
-from bikeped.telemetry.http import HttpServer
+from bikeped.telemetry.http_server import HttpServer
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 ARGUMENTS = [

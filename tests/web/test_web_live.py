@@ -19,7 +19,7 @@ from web_fakes import OPEN, SIGNALS, Scene, inside, small
 from bikeped.config import load_config
 from bikeped.pipeline.replay import replay
 from bikeped.pipeline.web_context import Inside
-from bikeped.telemetry.http import HttpServer
+from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.web.live import Live, add_live, shown_source
@@ -406,7 +406,7 @@ def test_no_page_of_the_service_changes_what_it_decides(make_clip, small_config)
 def test_pages_change_no_decision(make_clip, small_config, tmp_path):
     """The same events, byte for byte, with a visitor and without."""
     from bikeped.pipeline.replay import ReplayFiles
-    from bikeped.telemetry.messages import decision_view
+    from bikeped.telemetry.builders import decision_view
 
     clip = make_clip("c.avi", 20)
     views = []

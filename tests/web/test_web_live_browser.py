@@ -22,7 +22,7 @@ from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
 from bikeped.pipeline.replay import ReplayFiles, ReplayResult, replay
-from bikeped.telemetry.messages import parse_event
+from bikeped.telemetry.builders import parse_event
 from bikeped.web.live import Live, add_live
 from bikeped.web.server import make_pages
 from bikeped.web.service import ServicePages
@@ -80,7 +80,7 @@ class Running:
         self.url = ""
         handler = logging.Handler(logging.INFO)
         handler.emit = self._heard  # type: ignore[method-assign]
-        self._log = logging.getLogger("bikeped.telemetry.http")
+        self._log = logging.getLogger("bikeped.telemetry.http_server")
         self._handler, self._level = handler, self._log.level
         self._log.addHandler(handler)
         self._log.setLevel(logging.INFO)

@@ -17,7 +17,7 @@ from web_fakes import LOCKED, OPEN, TOKEN
 
 from bikeped.config import WebConfig, parse_config
 from bikeped.errors import ConfigError
-from bikeped.telemetry.http import HttpServer
+from bikeped.telemetry.http_server import HttpServer
 from bikeped.web.security import COOKIE, MAX_BODY, SESSION_S, Access, Failures, open_access
 from bikeped.web.server import Page, add_page, make_pages
 

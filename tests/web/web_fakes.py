@@ -14,7 +14,7 @@ from bikeped.pipeline.detection_stage import Picture
 from bikeped.pipeline.loop import Outcome
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside
-from bikeped.telemetry.messages import Counters, HealthMessage, Part, health_message
+from bikeped.telemetry.builders import Counters, HealthMessage, Part, health_message
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.types import Colour, Detections, Frame, Kind, Signal
 from bikeped.web.security import Access

@@ -59,7 +59,7 @@ def command(
     from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.models import BUNDLED, NOT_FOR_STREETS
     from bikeped.pipeline.replay import ReplayFiles, replay
-    from bikeped.telemetry.http import port_error
+    from bikeped.telemetry.http_server import port_error
 
     if web_place is not None:
         overrides += web_overrides(web_place)

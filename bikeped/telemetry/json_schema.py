@@ -1,6 +1,6 @@
 """JSON Schemas of all messages, from the very types that build them.
 
-`python -m bikeped.telemetry.schemas docs/messages` writes one file a message.
+`python -m bikeped.telemetry.json_schema docs/messages` writes one file a message.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from bikeped.errors import TelemetryError
-from bikeped.telemetry import shapes
+from bikeped.telemetry import schema as shapes
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -65,7 +65,7 @@ def write(directory: Path) -> list[Path]:
 def main(arguments: list[str]) -> int:
     """Writes the schemas into the one directory named; returns the exit status."""
     if len(arguments) != 1:
-        print("usage: python -m bikeped.telemetry.schemas DIRECTORY", file=sys.stderr)
+        print("usage: python -m bikeped.telemetry.json_schema DIRECTORY", file=sys.stderr)
         return TelemetryError.exit_status
     try:
         for path in write(Path(arguments[0])):

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import TelemetryError
-from bikeped.telemetry.shapes import (
+from bikeped.telemetry.schema import (
     Availability,
     CameraHealth,
     Counters,
