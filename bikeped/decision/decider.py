@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from bikeped.decision.rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
 from bikeped.decision.rules import PairVerdicts, RuleSettings, judge
 from bikeped.decision.stages import remembered, resolve
+from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
 from bikeped.types import (
     BoolArray,
     Decision,

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from bikeped.decision.rows import IndexArray, Pairs, TrackRows
+from bikeped.decision.track_rows import IndexArray, Pairs, TrackRows
 from bikeped.types import BoolArray, FloatArray
 
 RuleName = Literal["pairwise", "naive", "ttc", "distance"]

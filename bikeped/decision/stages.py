@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.decision.rows import IndexArray
+from bikeped.decision.track_rows import IndexArray
 from bikeped.types import BoolArray, FloatArray, State
 
 _EPSILON_S = 1e-6

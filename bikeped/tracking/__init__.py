@@ -1,6 +1,6 @@
 """The bird's-eye-view tracker and the latency predictor. Pure: time is passed in."""
 
-from bikeped.tracking.lanes import LaneTracker, TrackerSettings
+from bikeped.tracking.batch_tracker import LaneTracker, TrackerSettings
 from bikeped.tracking.predictor import predict
 from bikeped.tracking.tracker import Tracker
 

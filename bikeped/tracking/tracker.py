@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bikeped.tracking.lanes import LaneTracker, TrackerSettings
+from bikeped.tracking.batch_tracker import LaneTracker, TrackerSettings
 from bikeped.types import FloatArray, GroundPoints, Tracks
 
 _EPSILON_S = 1e-6
