@@ -12,7 +12,7 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
-    from bikeped.web.service import ServicePages
+    from bikeped.web.service_pages import ServicePages
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -45,6 +45,6 @@ def say_where(address: str) -> None:
 
 def open_pages(loaded: LoadedConfig) -> ServicePages:
     """The pages of a service or a replay; ConfigError when others could see them unasked."""
-    from bikeped.web.service import ServicePages
+    from bikeped.web.service_pages import ServicePages
 
     return ServicePages(loaded)

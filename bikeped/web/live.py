@@ -20,9 +20,9 @@ from aiohttp import hdrs, web
 from bikeped.config import WebConfig
 from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.latency import STAGES
-from bikeped.web.painter import Painter
+from bikeped.web.live_picture import Painter
+from bikeped.web.live_state import Watch
 from bikeped.web.server import Page, add_page
-from bikeped.web.watch import Watch
 
 #: At most so many messages a second to one page.
 EVENTS_HZ = 10.0

@@ -19,7 +19,7 @@ from bikeped.lab.rendering.clip import read_sidecar, sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import parse_scenario
 from bikeped.pipeline.replay import replay
 from bikeped.types import Detections
-from bikeped.web.service import ServicePages
+from bikeped.web.service_pages import ServicePages
 
 if TYPE_CHECKING:
     from screenshots import Studio

@@ -19,7 +19,7 @@ from bikeped.web.align import add_align
 from bikeped.web.align_grid import ground_grid
 from bikeped.web.align_points import values_of
 from bikeped.web.server import make_pages
-from bikeped.web.service import ServicePages
+from bikeped.web.service_pages import ServicePages
 
 ROOT = Path(__file__).parents[2]
 #: The camera that the fakes' frames are of.

@@ -23,9 +23,9 @@ from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.web.live import Live, add_live, shown_source
+from bikeped.web.live_state import ALERTS, TREND_S, Watch
 from bikeped.web.server import make_pages
-from bikeped.web.service import ServicePages
-from bikeped.web.watch import ALERTS, TREND_S, Watch
+from bikeped.web.service_pages import ServicePages
 
 PATIENCE_S = 20.0
 

@@ -24,9 +24,9 @@ from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
 from bikeped.pipeline.replay import ReplayFiles, ReplayResult, replay
 from bikeped.telemetry.builders import parse_event
 from bikeped.web.live import Live, add_live
+from bikeped.web.live_state import Watch
 from bikeped.web.server import make_pages
-from bikeped.web.service import ServicePages
-from bikeped.web.watch import Watch
+from bikeped.web.service_pages import ServicePages
 
 PATIENCE_S = 60.0
 

@@ -14,9 +14,9 @@ from bikeped.telemetry.http_server import add_monitoring
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align
 from bikeped.web.live import Live, add_live
+from bikeped.web.live_state import Watch
 from bikeped.web.security import open_access
 from bikeped.web.server import make_pages
-from bikeped.web.watch import Watch
 
 
 class ServicePages:

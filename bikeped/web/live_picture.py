@@ -25,7 +25,7 @@ from bikeped.pipeline.rate_limited_log import Seldom
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.worker_threads import Worker
 from bikeped.types import FloatArray, ImageArray, Signal
-from bikeped.web.watch import Watch
+from bikeped.web.live_state import Watch
 
 log = logging.getLogger(__name__)
 
