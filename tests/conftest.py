@@ -22,6 +22,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from bikeped.lab.rendering.avi_writer import AviWriter
 
+#: `serve`, `open_page` and a headless Chromium, for the pages of device and lab.
+pytest_plugins = ["browser_fixtures"]
+
 MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
 DEADLINE_S = 30.0  # generous: reached only by a failure
 

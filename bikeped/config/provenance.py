@@ -22,7 +22,7 @@ from bikeped.errors import BikepedError
 #: What turns positions into a state on the pole; the simulation runs the very same code.
 DECIDING_CODE = ("decision", "geometry", "tracking")
 #: What the figures of a promotion were measured with.
-MEASURING_CODE = ("conformance",)
+MEASURING_CODE = ("lab/scenarios", "lab/simulation", "lab/experiments", "lab/governance")
 
 
 class Provenance(msgspec.Struct, frozen=True, kw_only=True):

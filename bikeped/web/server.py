@@ -34,7 +34,8 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-_STATIC = Path(__file__).with_name("static")
+#: Files that all pages share, and those of the live and align pages.
+STATIC = Path(__file__).with_name("static")
 _TYPES = {
     ".html": "text/html",
     ".css": "text/css",
@@ -88,7 +89,7 @@ def make_pages(access: Access, *adders: Callable[[web.Application], None]) -> we
     app = web.Application(
         middlewares=[guard(access, login, failures), _errors], client_max_size=MAX_BODY
     )
-    app[PAGES], app[_ACCESS], app[_FILES] = [], access, _load_static()
+    app[PAGES], app[_ACCESS], app[_FILES] = [], access, _load_static(STATIC)
     app.on_response_prepare.append(_harden)
     app.router.add_get("/static/{name:.+}", _static)
     app.router.add_get("/favicon.ico", _favicon)
@@ -108,8 +109,13 @@ def make_pages(access: Access, *adders: Callable[[web.Application], None]) -> we
     return app
 
 
-def add_page(app: web.Application, page: Page) -> None:
-    """Adds a page and its entry in the navigation."""
+def add_page(app: web.Application, page: Page, static: Path | None = None) -> None:
+    """Adds a page and its entry in the navigation.
+
+    `static`: a folder whose files are served below /static/ beside the common ones.
+    """
+    if static is not None:
+        app[_FILES].update(_load_static(static))
     app[PAGES].append(page)
     app[PAGES].sort(key=lambda p: _ORDER.index(p.path) if p.path in _ORDER else len(_ORDER))
 
@@ -165,13 +171,13 @@ async def _harden(_request: web.Request, response: web.StreamResponse) -> None:
     response.headers.popall(hdrs.SERVER, None)
 
 
-def _load_static() -> dict[str, _File]:
-    """All files of the pages, by name: what is not here is not served, whatever the path."""
+def _load_static(folder: Path) -> dict[str, _File]:
+    """All files of a folder, by name: what is not here is not served, whatever the path."""
     files = {}
-    for path in sorted(_STATIC.rglob("*")):
+    for path in sorted(folder.rglob("*")):
         if path.is_file() and path.suffix in _TYPES and not path.name.startswith("."):
             data = path.read_bytes()
-            name = path.relative_to(_STATIC).as_posix()
+            name = path.relative_to(folder).as_posix()
             etag = hashlib.sha256(data).hexdigest()[:20]
             files[name] = _File(data, _TYPES[path.suffix], etag)
     return files

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 from rich.markup import escape
@@ -32,9 +31,6 @@ from bikeped.lab.cli.conformance_shared import (
     suite_options,
     trials_option,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 @click.group("conformance")

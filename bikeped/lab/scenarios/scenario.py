@@ -158,7 +158,7 @@ def load_scenarios(folder: Path) -> list[Scenario]:
 
 def bundled_folder() -> Path:
     """Folder of the 24 scenarios that come with bikeped."""
-    return Path(__file__).parent / "scenarios"
+    return Path(__file__).parent / "bundled"
 
 
 def parse_scenario(text: str, source: str) -> Scenario:

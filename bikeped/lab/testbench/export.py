@@ -36,6 +36,7 @@ from bikeped.lab.testbench.pages import configurations
 from bikeped.lab.testbench.playback import coverage, playback
 from bikeped.lab.testbench.run import BenchSuite, Workbench
 from bikeped.lab.testbench.settings import in_force
+from bikeped.web.server import STATIC as SHARED_STATIC
 
 _STATIC = Path(__file__).with_name("static")
 #: In the order in which they need one another.
@@ -81,6 +82,12 @@ def make_report(
         "in_force": name,
     }
     return _page(found, data, suite, loaded, command)
+
+
+def _static_file(name: str) -> Path:
+    """A file of the test bench, or one that all pages share."""
+    own = _STATIC / name
+    return own if own.is_file() else SHARED_STATIC / name
 
 
 def _play(
@@ -143,10 +150,10 @@ def _page(
         "command": escape(command),
         "decision": escape(json.dumps(msgspec.to_builtins(loaded.config.decision))),
     }
-    body = _filled((_STATIC / "report.html").read_text(encoding="utf-8"), parts)
-    style = "\n".join((_STATIC / name).read_text(encoding="utf-8") for name in _STYLES)
-    theme = (_STATIC / "theme.js").read_text(encoding="utf-8")
-    script = bundle({name: (_STATIC / name).read_text(encoding="utf-8") for name in _SCRIPTS})
+    body = _filled(_static_file("report.html").read_text(encoding="utf-8"), parts)
+    style = "\n".join(_static_file(name).read_text(encoding="utf-8") for name in _STYLES)
+    theme = _static_file("theme.js").read_text(encoding="utf-8")
+    script = bundle({name: _static_file(name).read_text(encoding="utf-8") for name in _SCRIPTS})
     policy = (
         "default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; "
         f"style-src {_hash(style)}; script-src {_hash(theme)} {_hash(script)}"

@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -120,7 +121,7 @@ def add_testbench(
             bench = parse_link(found.text, base)
         return json_answer({"bench": bench, "link": link_of(bench, base)})
 
-    add_page(app, PAGE)
+    add_page(app, PAGE, Path(__file__).with_name("static"))
     app.router.add_get("/testbench/about", tell)
     app.router.add_post("/testbench/scenario", scenario)
     app.router.add_post("/testbench/suite", suite)

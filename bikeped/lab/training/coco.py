@@ -27,7 +27,7 @@ from bikeped.types import FloatArray, ImageArray
 
 _JPEG = b"\xff\xd8"
 _LARGEST_SIDE = 32768
-#: Among the furniture of a picture: what a network took for somebody (`bikeped.lab.training.hard_negative_mining`).
+#: Among the furniture of an image: false detections of a network (`hard_negative_mining`).
 MISTAKEN = "mistaken"
 Box = tuple[float, float, float, float]  #: x1, y1, x2, y2 in pixels of a picture
 
@@ -176,7 +176,7 @@ def read_coco(data: Path, images_dir: Path | None = None) -> CocoData:
 def furniture(image: CocoImage) -> list[tuple[str, Box]]:
     """What stands in a drawn picture and is nobody, and its box within the picture.
 
-    bikeped's own addition to an image's entry (`bikeped.lab.rendering`): `furniture`, a list of `what` and
+    bikeped's own addition to an image's entry (`lab.rendering`): `furniture`, a list of `what` and
     `bbox`, which may reach beyond the picture. Raises DataSetError where it is no such list.
     """
     found: list[tuple[str, Box]] = []

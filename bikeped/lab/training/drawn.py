@@ -97,7 +97,7 @@ def draw_set(
 def part_camera(
     settings: DrawnSettings, number: int, loaded: LoadedConfig
 ) -> tuple[SceneCamera | None, tuple[int, int]]:
-    """The camera of a part (None: one of `bikeped.lab.rendering`'s own for every street) and the size."""
+    """The camera of a part (None: `lab.rendering` draws one for each street) and the size."""
     random = np.random.default_rng([settings.seed, number, 7])
     size = _LARGE if random.random() < settings.large else _SMALL
     if random.random() >= settings.configured:

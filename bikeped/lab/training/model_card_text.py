@@ -29,9 +29,10 @@ doctor` say so where it is configured.
 
 ## What it was trained on
 
-{pictures} pictures drawn by `bikeped.lab.rendering` ({objects} objects), and nothing else: no photograph,
-no other network's weights. {configured:.0%} were seen by the configured camera from varied spots,
-the others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6 to 5.5 m high).
+{pictures} pictures drawn by `bikeped.lab.rendering` ({objects} objects), and nothing else: no
+photograph, no other network's weights. {configured:.0%} were seen by the configured camera from
+varied spots, the others through fisheyes of all kinds (150 to 205 degrees, four projections, 2.6
+to 5.5 m high).
 There is more of what is hard to tell than in the streets it is measured on: {mix}.
 
 | | |

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from endtoend_fakes import drawn, found
 from hypothesis import given
 from hypothesis import strategies as st
-from pixels_fakes import drawn, found
 
 from bikeped.lab.endtoend.matching import iou, match
 from bikeped.types import Detections, Kind

@@ -26,7 +26,7 @@ from bikeped.lab.simulation.perception import RecallModel, misses, trial_generat
 from bikeped.lab.simulation.simulate import Scene, delayed, rows_of, states, track
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 
-CONFIG = Path(__file__).parents[2] / "config.yaml"
+CONFIG = Path(__file__).parents[3] / "config.yaml"
 NAMES = ("Bike Approaches Ped", "Multiple VRUs", "Safe Crossing", "Swerving Cyclist")
 TWO = {name: CONFIGURATIONS[name] for name in ("selected", "narrow")}
 

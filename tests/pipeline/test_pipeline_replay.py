@@ -9,7 +9,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from service_fakes import FakeEye, seen
+from pipeline_fakes import FakeEye, seen
 
 from bikeped.config import load_config
 from bikeped.errors import BikepedError, CaptureError, GeometryError, TelemetryError

@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
 from bikeped.errors import DetectorError  # noqa: E402
-from bikeped.lab.training import device
+from bikeped.lab.training import device  # noqa: E402
 
 
 def test_auto_is_a_device_that_is_there():

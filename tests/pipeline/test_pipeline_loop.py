@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 import pytest
-from service_fakes import PATIENCE_S, FakeEye, Rig, seen, small
+from pipeline_fakes import PATIENCE_S, FakeEye, Rig, seen, small
 
 import bikeped.pipeline.loop as loop_module
 from bikeped.detection.base import DetectorAnswer

@@ -21,7 +21,7 @@ from bikeped.lab.result_tables import Result
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
 
-CONFIG = Path(__file__).parents[2] / "config.yaml"
+CONFIG = Path(__file__).parents[3] / "config.yaml"
 LOADED = load_config(CONFIG)
 SMALL = rep.Settings(trials=2, maxiter=1, popsize=2, deployment_trials=2, placement_trials=2)
 

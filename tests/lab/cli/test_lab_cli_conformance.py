@@ -15,7 +15,7 @@ from bikeped.cli.main import main
 from bikeped.lab.scenarios.scenario import bundled_folder
 from bikeped.lab.simulation.suite import CONFIGURATIONS
 
-CONFIG = str(Path(__file__).parents[2] / "config.yaml")
+CONFIG = str(Path(__file__).parents[3] / "config.yaml")
 FILES = ("swerving-cyclist.yaml", "safe-crossing.yaml")
 
 SHARE = {"type": ["number", "null"], "minimum": 0, "maximum": 1}

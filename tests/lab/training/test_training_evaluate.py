@@ -201,7 +201,7 @@ def test_models_are_told_apart(tmp_path):
 
 
 def test_drawn_scenes_are_read_and_judged_by_distance(tmp_path):
-    """Data of `bikeped.lab.rendering`: a network that answers the truth finds everything, near and far."""
+    """Data of `bikeped.lab.rendering`: the truth finds everything, near and far."""
     data = read_coco(write_dataset(tmp_path / "scenes", 4, 1, size=(480, 270)))
     assert list(data.categories.values()) == ["pedestrian", "cyclist", "vehicle"]
     scale, top = 320 / 480, (320 - 180) // 2

@@ -70,7 +70,7 @@ def main():
     GOLDEN.mkdir(exist_ok=True)
     for old in GOLDEN.glob("*.txt"):
         old.unlink()
-    loaded = load_config(HERE.parents[1] / "config.yaml")
+    loaded = load_config(HERE.parents[2] / "config.yaml")
     suite = Suite.load(load_scenarios(bundled_folder()), loaded)
     for scenario, scene in zip(suite.scenarios, suite.scenes(), strict=True):
         slug = Path(scenario.source).stem

@@ -24,8 +24,8 @@ from bikeped.lab.training.coco import read_coco
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
-from bikeped.lab.training import optional_deps as needs
-from bikeped.lab.training import yolo
+from bikeped.lab.training import optional_deps as needs  # noqa: E402
+from bikeped.lab.training import yolo  # noqa: E402
 from bikeped.lab.training.yolo import YoloOrder, export_yolo, train_yolo, write_data  # noqa: E402
 
 

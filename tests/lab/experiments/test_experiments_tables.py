@@ -22,7 +22,7 @@ from bikeped.lab.simulation.perception import RecallModel, localise, see
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.lab.simulation.truth import judge_truth
 
-CONFIG = Path(__file__).parents[2] / "config.yaml"
+CONFIG = Path(__file__).parents[3] / "config.yaml"
 NAMES = ("Bike Approaches Ped", "Multiple VRUs", "Safe Crossing", "Swerving Cyclist")
 SELECTED = CONFIGURATIONS["selected"]
 LOADED = load_config(CONFIG)

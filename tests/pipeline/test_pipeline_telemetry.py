@@ -7,8 +7,8 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from pipeline_fakes import Clock, Rig, seen, small
 from prometheus_client import generate_latest
-from service_fakes import Clock, Rig, seen, small
 
 from bikeped.feedback import SignalLogic
 from bikeped.pipeline.health_report import health_line, tell_health
@@ -191,7 +191,7 @@ async def test_a_failing_health_report_costs_a_message_and_no_more(caplog):
 
 
 def test_the_announcer_refreshes_what_it_shows():
-    from service_fakes import FakeLight
+    from pipeline_fakes import FakeLight
 
     light = FakeLight()
     announcer = Announcer(SignalLogic(), light)  # type: ignore[arg-type]

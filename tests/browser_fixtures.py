@@ -1,7 +1,7 @@
 """Pages in a real headless Chromium, and servers for them in a thread.
 
 Browser tests are plain functions (the synchronous API) in modules of their own, named
-`test_web_*_browser.py`: Playwright's loop and pytest-asyncio's do not share a thread, so such a
+`test_*_browser.py`: Playwright's loop and pytest-asyncio's do not share a thread, so such a
 module holds no `async def` test.
 
     def test_it(serve, open_page):

@@ -11,7 +11,7 @@ from bikeped.lab.scenarios.scenario import HAZARDS, bundled_folder, load_scenari
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.truth import judge_truth
 
-PAGE = Path(__file__).parents[2] / "docs" / "scenarios.md"
+PAGE = Path(__file__).parents[3] / "docs" / "scenarios.md"
 FOLDER = "../bikeped/conformance/scenarios"
 INTRO = """\
 # The 24 scenarios

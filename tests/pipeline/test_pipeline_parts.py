@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from service_fakes import PATIENCE_S, Clock, FakeEye
+from pipeline_fakes import PATIENCE_S, Clock, FakeEye
 
 from bikeped.capture import FrameGrabber, open_source
 from bikeped.errors import CaptureError

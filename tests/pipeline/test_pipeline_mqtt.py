@@ -10,7 +10,7 @@ from pathlib import Path
 
 import jsonschema
 import numpy as np
-from service_fakes import PATIENCE_S, FakeEye, seen
+from pipeline_fakes import PATIENCE_S, FakeEye, seen
 
 from bikeped.capture import FrameSource
 from bikeped.config import load_config

@@ -10,7 +10,7 @@ from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import load_scenario
 from bikeped.pipeline.track_and_decide import Judge
 
-CONFIG = Path(__file__).parents[2] / "config.yaml"
+CONFIG = Path(__file__).parents[3] / "config.yaml"
 
 
 def event(t, state, pair=None, gap=10.0, lost=False, **more):
