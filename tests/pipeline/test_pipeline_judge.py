@@ -7,7 +7,7 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.pipeline.track_and_decide import Judge
-from bikeped.types import Detections, Kind, State
+from bikeped.types import Detections, GroundPoints, Kind, State
 
 P, C = Kind.PEDESTRIAN, Kind.CYCLIST
 
@@ -54,3 +54,38 @@ def test_a_reset_forgets_what_was_seen():
     judge.reset()
     tracks = judge.judge(Detections.empty(), 3840, 2160, 0.0, 0.0).tracks
     assert len(tracks) == 0
+
+
+@pytest.mark.parametrize(
+    ("latency", "age_s", "ahead_s"),
+    [
+        (['compensation="off"', "camera_offset_s=0.2"], 0.3, 0.0),
+        (["compensation=measured"], 0.3, 0.3),
+        (["compensation=measured", "camera_offset_s=0.1"], 0.3, 0.4),  # a delay adds to the age
+        (["compensation=measured", "max_s=0.25"], 0.3, 0.25),
+        (["compensation=measured", "camera_offset_s=0.2", "max_s=0.25"], 0.1, 0.25),
+        (["compensation=frames", "frames=6"], 9.9, 0.2),
+        (["compensation=frames", "frames=6", "camera_offset_s=0.1"], 9.9, 0.3),
+        (["compensation=frames", "frames=60", "max_s=1.5"], 0.0, 1.5),
+    ],
+)
+def test_the_rule_is_asked_about_the_place_ahead_by_age_and_offset_up_to_the_bound(
+    monkeypatch, latency, age_s, ahead_s
+):
+    """A cyclist at a steady speed: how far the rule's position is ahead of the track's."""
+    judge = Judge(load_config(None, overrides=[f"latency.{setting}" for setting in latency]))
+    asked = []
+    decide = judge._decider.step
+
+    def watched(captured_s, number, kind, xy_m):
+        asked.append(xy_m)
+        return decide(captured_s, number, kind, xy_m)
+
+    monkeypatch.setattr(judge._decider, "step", watched)
+    for frame in range(90):
+        points = GroundPoints(
+            np.array([C], np.int8), np.array([[10.0, 4.0 * frame / 30]]), np.array([0])
+        )
+        judgement = judge.judge_points(points, frame / 30, age_s)
+    gap_m = asked[-1][0] - judgement.tracks.xy_m[0]
+    assert gap_m == pytest.approx([0.0, 4.0 * ahead_s], abs=0.02)

@@ -153,6 +153,23 @@ async def test_health_says_what_is_wrong_and_how_old_the_newest_frame_is(small_j
         assert "capture_age " in line
 
 
+async def test_a_geometry_fault_makes_the_cameras_health_bad_and_no_other():
+    async with TelemetryRig() as rig:
+        part = Part(ok=True, detail="simulated")
+        await rig.well()
+        rig.clock.now_s += 0.03
+        rig.feed.put(rig.clock.now_s, width=96, height=96)
+        await rig.recorder.until(lambda: rig.recorder.name == "FAULT")
+        message = valid("health", encode(rig.telemetry.health(rig.loop, part)))
+        assert not message["camera"]["ok"]
+        assert "proportions" in message["camera"]["detail"]
+        assert message["detector"]["ok"]
+        assert message["light"]["ok"]
+        assert [fault.split(":")[0] for fault in message["faults"]] == ["geometry"]
+        await rig.frames(5)
+        assert json.loads(encode(rig.telemetry.health(rig.loop, part)))["camera"]["ok"]
+
+
 async def test_metrics_count_what_no_single_frame_tells():
     async with TelemetryRig() as rig:
         await rig.well()
