@@ -183,7 +183,7 @@ class Tracks:
 
 
 @dataclass(frozen=True)
-class PairNumbers:
+class PairMetrics:
     """The figures that one cyclist-pedestrian pair was judged by."""
 
     cyclist_id: int
@@ -204,7 +204,7 @@ class Decision:
     time_s: float
     state: State
     sentence: str
-    pair: PairNumbers | None = None  #: the pair that fired (ALERT) or the nearest one (WARNING)
+    pair: PairMetrics | None = None  #: the pair that fired (ALERT) or the nearest one (WARNING)
 
 
 class Colour(str, enum.Enum):

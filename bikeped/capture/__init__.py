@@ -1,7 +1,7 @@
 """Where pictures come from: cameras, recordings and folders in, `Frame`s out.
 
 `open_source` picks the source by its text; `FrameGrabber` keeps the newest frame of a live one;
-`Paced` plays a recording as a live camera would; `JpegDecoder` decodes at the scale needed.
+`PacedSource` plays a recording as a live camera would; `JpegDecoder` decodes at the scale needed.
 """
 
 from bikeped.capture.base import FrameSource
@@ -9,7 +9,7 @@ from bikeped.capture.images import ImageSource
 from bikeped.capture.jpeg import JpegDecoder, read_size
 from bikeped.capture.latest import FrameGrabber
 from bikeped.capture.network import NetworkSource
-from bikeped.capture.paced import Paced
+from bikeped.capture.paced import PacedSource
 from bikeped.capture.sources import open_source
 from bikeped.capture.v4l2 import V4l2Source
 from bikeped.capture.video import VideoSource
@@ -20,7 +20,7 @@ __all__ = [
     "ImageSource",
     "JpegDecoder",
     "NetworkSource",
-    "Paced",
+    "PacedSource",
     "V4l2Source",
     "VideoSource",
     "open_source",

@@ -10,7 +10,7 @@ from bikeped.capture.base import FrameSource
 from bikeped.types import Frame
 
 
-class Paced(FrameSource):
+class PacedSource(FrameSource):
     """Gives each frame of `source` when its media time has come, the first one at once.
 
     `captured_s` is rebased on `clock` (monotonic seconds), spaced as in the recording. No frame is

@@ -1,22 +1,22 @@
 """The three-stage decision. Pure: positions and times in, state and reasons out."""
 
-from bikeped.decision.decider import Decider, chosen_pair, explain, pair_numbers
-from bikeped.decision.rules import PairVerdicts, RuleSettings, judge
-from bikeped.decision.stages import frames_with, remembered, resolve
+from bikeped.decision.decider import Decider, explain, pair_metrics, select_pair
+from bikeped.decision.rules import PairChecks, RuleSettings, evaluate_rule
+from bikeped.decision.stages import frame_mask, is_remembered, resolve_state
 from bikeped.decision.track_rows import Pairs, TrackRows, pair_rows
 
 __all__ = [
     "Decider",
-    "PairVerdicts",
+    "PairChecks",
     "Pairs",
     "RuleSettings",
     "TrackRows",
-    "chosen_pair",
+    "evaluate_rule",
     "explain",
-    "frames_with",
-    "judge",
-    "pair_numbers",
+    "frame_mask",
+    "is_remembered",
+    "pair_metrics",
     "pair_rows",
-    "remembered",
-    "resolve",
+    "resolve_state",
+    "select_pair",
 ]

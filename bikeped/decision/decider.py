@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from bikeped.decision.rules import PairVerdicts, RuleSettings, judge
-from bikeped.decision.stages import remembered, resolve
+from bikeped.decision.rules import PairChecks, RuleSettings, evaluate_rule
+from bikeped.decision.stages import is_remembered, resolve_state
 from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
 from bikeped.types import (
     BoolArray,
@@ -15,7 +15,7 @@ from bikeped.types import (
     FloatArray,
     IntArray,
     KindArray,
-    PairNumbers,
+    PairMetrics,
     State,
 )
 
@@ -23,7 +23,7 @@ from bikeped.types import (
 class Decider:
     """Holds the last fraction of a second of positions and the cyclist memory.
 
-    `step` once a frame, with the reported tracks in ascending id and times that increase.
+    `decide` once a frame, with the reported tracks in ascending id and times that increase.
     """
 
     def __init__(self, settings: RuleSettings) -> None:
@@ -31,29 +31,29 @@ class Decider:
         self._buffer = RowBuffer(max(settings.lookback_s, settings.speed_window_s))
         self._last_cyclist_s = -math.inf
 
-    def step(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> Decision:
+    def decide(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> Decision:
         """The decision at `time_s`; `ids` [n] ascending, `kind` [n], `xy_m` [n, 2]."""
         rows, newest = self._buffer.append(time_s, ids, kind, xy_m)
         pairs = pair_rows(rows, self._buffer.frames, newest)
-        verdicts = judge(rows, pairs, self.settings)
+        verdicts = evaluate_rule(rows, pairs, self.settings)
         if np.count_nonzero(kind == CYCLIST):
             self._last_cyclist_s = time_s
         pedestrians = np.count_nonzero(kind == PEDESTRIAN)
-        code = resolve(
+        code = resolve_state(
             np.asarray([pedestrians > 0]),
-            remembered(
+            is_remembered(
                 np.asarray([time_s]), np.asarray([self._last_cyclist_s]), self.settings.memory_s
             ),
             np.asarray([np.count_nonzero(verdicts.fires) > 0]),
         )
         state = State(code.item())
-        index = chosen_pair(state, verdicts.fires, verdicts.distance_m)
-        pair = None if index is None else pair_numbers(index, rows, pairs, verdicts, self.settings)
+        index = select_pair(state, verdicts.fires, verdicts.distance_m)
+        pair = None if index is None else pair_metrics(index, rows, pairs, verdicts, self.settings)
         sentence = explain(state, pair, pedestrians, time_s - self._last_cyclist_s, self.settings)
         return Decision(time_s, state, sentence, pair)
 
 
-def chosen_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int | None:
+def select_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int | None:
     """Whom a frame's decision is about, of its pairs: the first in track order that fired (ALERT),
     or the nearest (WARNING)."""
     if state is State.ALERT:
@@ -63,11 +63,11 @@ def chosen_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int |
     return None
 
 
-def pair_numbers(
-    index: int, rows: TrackRows, pairs: Pairs, verdicts: PairVerdicts, settings: RuleSettings
-) -> PairNumbers:
+def pair_metrics(
+    index: int, rows: TrackRows, pairs: Pairs, verdicts: PairChecks, settings: RuleSettings
+) -> PairMetrics:
     """The figures by which pair `index` was judged."""
-    return PairNumbers(
+    return PairMetrics(
         cyclist_id=int(rows.id[pairs.cyclist_row[pairs.cyclist[index]]]),
         pedestrian_id=int(rows.id[pairs.pedestrian_row[index]]),
         distance_m=float(verdicts.distance_m[index]),
@@ -82,7 +82,7 @@ def pair_numbers(
 
 def explain(
     state: State,
-    pair: PairNumbers | None,
+    pair: PairMetrics | None,
     pedestrians: int,
     since_cyclist_s: float,
     settings: RuleSettings,
@@ -115,7 +115,7 @@ def explain(
     return f"WARNING: {who} are {gap}, {_why_not(pair, settings)}."
 
 
-def _why_not(pair: PairNumbers, settings: RuleSettings) -> str:
+def _why_not(pair: PairMetrics, settings: RuleSettings) -> str:
     """Why the nearest pair does not alert."""
     if pair.distance_m < pair.d_min_m:
         return f"nearer than the {pair.d_min_m:g} m at which a warning still helps"

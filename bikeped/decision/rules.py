@@ -48,23 +48,23 @@ class RuleSettings:
 
 
 @dataclass(frozen=True)
-class PairVerdicts:
-    """What the rule says of each pair [m], and the numbers that made it say so.
+class PairChecks:
+    """The rule's checks of each pair [m], and the measurements behind them.
 
-    `judged` is false for pairs out of range, out of bounds or without an earlier position; they
-    have a lookback of 0 s and no displacement. A pair fires when it is judged and passes all tests:
-    `far_enough` (d_min), `near_enough` (d_max), `in_range` of the camera, `closing`, and `enough`
-    (the cyclist moved enough; rule ttc: soon together; rule distance: always). The last two are
-    false for pairs that are not judged.
+    A pair fires when it passes all of: `above_d_min`, `below_d_max`, `in_range` of the camera,
+    `evaluated`, `closing` and `displacement_ok` (the cyclist's displacement exceeds the minimum;
+    rule ttc: time to collision below `ttc_s`; rule distance: always). `evaluated` is false for
+    pairs that fail one of the first three or have no earlier position: these have a lookback of
+    0 s, no displacement, and neither of the last two.
     """
 
     fires: BoolArray
-    judged: BoolArray
-    far_enough: BoolArray
-    near_enough: BoolArray
+    evaluated: BoolArray
+    above_d_min: BoolArray
+    below_d_max: BoolArray
     in_range: BoolArray
     closing: BoolArray
-    enough: BoolArray
+    displacement_ok: BoolArray
     distance_m: FloatArray
     distance_then_m: FloatArray
     lookback_s: FloatArray
@@ -80,7 +80,7 @@ def stopping_distance(
     return speed_mps * reaction_s + speed_mps * speed_mps / (2 * deceleration_mps2)
 
 
-def judge(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairVerdicts:
+def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairChecks:
     """Applies the rule to every pair."""
     cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist], pairs.pedestrian_row
     c_now, p_now = rows.xy_m[cyclist], rows.xy_m[pedestrian]
@@ -91,9 +91,9 @@ def judge(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairVerdicts
         d_max = np.maximum(
             d_max, stopping_distance(speed, settings.reaction_s, settings.deceleration_mps2)
         )
-    far_enough, near_enough = distance >= settings.d_min_m, distance <= d_max
+    above_d_min, below_d_max = distance >= settings.d_min_m, distance <= d_max
     in_range = (_length(c_now) <= settings.max_range_m) & (_length(p_now) <= settings.max_range_m)
-    near = far_enough & near_enough & in_range
+    near = above_d_min & below_d_max & in_range
     # Only these are looked up in the past: of thousands of pairs in a crowd few are within bounds.
     index = near.nonzero()[0]
     c_then, p_then, elapsed = _look_back(
@@ -106,17 +106,17 @@ def judge(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairVerdicts
     count = len(pairs)
     distance_then, lookback, way = distance.copy(), np.zeros(count), np.zeros(count)
     distance_then[index], lookback[index], way[index] = then, elapsed, displacement
-    judged = lookback > 0
-    closing, enough = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-    closing[index], enough[index] = closes & judged[index], passes & judged[index]
-    return PairVerdicts(
-        fires=closing & enough,
-        judged=judged,
-        far_enough=far_enough,
-        near_enough=near_enough,
+    evaluated = lookback > 0
+    closing, displacement_ok = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    closing[index], displacement_ok[index] = closes & evaluated[index], passes & evaluated[index]
+    return PairChecks(
+        fires=closing & displacement_ok,
+        evaluated=evaluated,
+        above_d_min=above_d_min,
+        below_d_max=below_d_max,
         in_range=in_range,
         closing=closing,
-        enough=enough,
+        displacement_ok=displacement_ok,
         distance_m=distance,
         distance_then_m=distance_then,
         lookback_s=lookback,

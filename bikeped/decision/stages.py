@@ -14,7 +14,7 @@ _IDLE, _SAFE, _WARNING, _ALERT = (int(s) for s in State)
 _STATES = np.asarray([_IDLE, _IDLE, _IDLE, _IDLE, _SAFE, _SAFE, _WARNING, _ALERT], np.int8)
 
 
-def resolve(
+def resolve_state(
     pedestrian_present: BoolArray, cyclist_remembered: BoolArray, approaching: BoolArray
 ) -> npt.NDArray[np.int8]:
     """State codes [n]: IDLE without a pedestrian, SAFE without a remembered cyclist, else ALERT or
@@ -23,12 +23,12 @@ def resolve(
     return np.asarray(_STATES[stage])
 
 
-def remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:
+def is_remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:
     """Whether a cyclist was tracked within the memory; a memory of 0 s means now."""
     return np.asarray(now_s - last_cyclist_s <= memory_s + _EPSILON_S)
 
 
-def frames_with(frame: IndexArray, frames: int) -> BoolArray:
+def frame_mask(frame: IndexArray, frames: int) -> BoolArray:
     """[frames]: which of them are named in `frame`."""
     out = np.zeros(frames, np.bool_)
     out[frame] = True

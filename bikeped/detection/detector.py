@@ -20,7 +20,7 @@ from bikeped.detection.classes import UNMAPPED, class_names, kind_table, riders_
 from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.detection.nms import merge, suppress
 from bikeped.detection.output_layouts import Candidates, Layout, choose_layout, decode, pick_output
-from bikeped.detection.partial_persons import drop_halves
+from bikeped.detection.partial_persons import suppress_partial_person_boxes
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.detection.riders import join_riders
 from bikeped.detection.weights import first_layer
@@ -223,7 +223,7 @@ class NetworkDetector:
         keep = self._suppress(box, score, kind)
         steady = merge(box, score, kind, keep, self._config.merge_overlap)
         joined = join_riders(
-            drop_halves(Detections(kind[keep], score[keep], steady)),
+            suppress_partial_person_boxes(Detections(kind[keep], score[keep], steady)),
             self._rider_overlap,
             self._config.confidence,
         )

@@ -21,7 +21,7 @@ _HEIGHT = 0.8
 _WIDTH = 0.5
 
 
-def drop_halves(found: Detections) -> Detections:
+def suppress_partial_person_boxes(found: Detections) -> Detections:
     """The detections without pedestrians that are another's upper half; order is kept.
 
     The whole takes the greater confidence of the two.

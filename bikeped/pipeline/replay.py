@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.capture import FrameSource, Paced, open_source
+from bikeped.capture import FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback import LightDriver, SignalLogic, SimulatedLight
@@ -123,7 +123,7 @@ def replay(
         return asyncio.run(
             _replay(
                 loaded,
-                Paced(source) if realtime else source,
+                PacedSource(source) if realtime else source,
                 judge,
                 looking,
                 files,

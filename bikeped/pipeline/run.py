@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from bikeped import __version__
-from bikeped.capture import FrameGrabber, FrameSource, Paced, open_source
+from bikeped.capture import FrameGrabber, FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_driver, open_speaker
@@ -186,7 +186,7 @@ def _open_camera(loaded: LoadedConfig) -> FrameSource:
         fourcc=camera.fourcc,
     )
     # A recording in the camera's place is played at its own pace, as a rehearsal.
-    return source if source.live else Paced(source)
+    return source if source.live else PacedSource(source)
 
 
 async def _load_while_alive(

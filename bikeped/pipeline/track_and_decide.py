@@ -98,7 +98,7 @@ class Judge:
         self._last_s = captured_s
         tracks = self.tracker.update(points, captured_s)
         tracked = time.perf_counter()
-        decision = self._decider.step(
+        decision = self._decider.decide(
             captured_s, tracks.id, tracks.kind, self._ahead(tracks, age_s)
         )
         decided = time.perf_counter()

@@ -69,7 +69,7 @@ class TrackerSettings:
     acceleration: bool = True
 
 
-class LaneTracker:
+class BatchTracker:
     """Tracks of `lanes` independent scenes; `update` once a frame, then read the arrays.
 
     Arrays are [lanes, slots] (positions, velocities, accelerations [lanes, slots, 2]); slots with

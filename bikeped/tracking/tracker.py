@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bikeped.tracking.batch_tracker import LaneTracker, TrackerSettings
+from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 from bikeped.types import FloatArray, GroundPoints, Tracks
 
 _EPSILON_S = 1e-6
@@ -27,7 +27,7 @@ class Tracker:
         speed_window_s: float = 4 / 30,
         history_length: int = 30,
     ) -> None:
-        self.lanes = LaneTracker(settings)
+        self.lanes = BatchTracker(settings)
         self._speed_window_s = speed_window_s
         self._paths: dict[int, deque[tuple[float, float, float]]] = {}
         self._history_length = history_length

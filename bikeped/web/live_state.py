@@ -13,7 +13,7 @@ import numpy as np
 
 from bikeped.pipeline.loop import Outcome
 from bikeped.telemetry.latency import STAGES
-from bikeped.types import Decision, Kind, PairNumbers, Signal, State
+from bikeped.types import Decision, Kind, PairMetrics, Signal, State
 
 #: Alerts that are remembered.
 ALERTS = 20
@@ -34,7 +34,7 @@ class SeenTrack(msgspec.Struct, frozen=True):
 
 
 class SeenPair(msgspec.Struct, frozen=True):
-    """The figures that a pair was judged by, as `types.PairNumbers` has them."""
+    """The figures that a pair was judged by, as `types.PairMetrics` has them."""
 
     cyclist: int
     pedestrian: int
@@ -219,7 +219,7 @@ def _trend_point(second: int, rows: list[Mapping[str, float]]) -> TrendPoint:
     return TrendPoint(float(second), len(rows), tuple(p50), tuple(p95))
 
 
-def _pair(pair: PairNumbers | None) -> SeenPair | None:
+def _pair(pair: PairMetrics | None) -> SeenPair | None:
     if pair is None:
         return None
     return SeenPair(

@@ -21,7 +21,7 @@ def run(figures: Figures) -> None:
     from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
     from bikeped.lab.simulation.simulate import SIMULATION_TRACKER
     from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare
-    from bikeped.tracking import LaneTracker
+    from bikeped.tracking import BatchTracker
 
     loaded = load_config()
     scenarios = load_scenarios(bundled_folder())
@@ -33,7 +33,7 @@ def run(figures: Figures) -> None:
         """One configuration with localisation error, frame by frame: 1/14 of the comparison."""
         suite = Suite.load(scenarios, loaded)
         for scene in suite.scenes():
-            tracker = LaneTracker(SIMULATION_TRACKER)
+            tracker = BatchTracker(SIMULATION_TRACKER)
             decider = Decider(rule_settings(CONFIGURATIONS["selected"]))
             for i in range(len(scene.xy_m)):
                 there = scene.detected[i]
@@ -41,7 +41,7 @@ def run(figures: Figures) -> None:
                 tracker.update(i / 30, xy[None], kind[None])
                 at = tracker.reported[0]
                 order = tracker.id[0][at].argsort()
-                decider.step(
+                decider.decide(
                     i / 30,
                     tracker.id[0][at][order],
                     tracker.kind[0][at][order],

@@ -40,7 +40,7 @@ def run(figures: Figures) -> None:
             for i, (kinds, xy) in enumerate(scenes):
                 points = GroundPoints(kinds, xy, np.arange(len(kinds)))
                 tracks = tracker.update(points, i / 30)
-                decider.step(i / 30, tracks.id, tracks.kind, tracks.xy_m)
+                decider.decide(i / 30, tracks.id, tracks.kind, tracks.xy_m)
 
         def obvious(scenes: list[Any] = scenes) -> None:
             plain = PlainPole()

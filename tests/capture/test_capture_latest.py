@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from bikeped.capture import FrameGrabber, FrameSource, Paced, VideoSource
+from bikeped.capture import FrameGrabber, FrameSource, PacedSource, VideoSource
 from bikeped.capture.latest import backoff_s
 from bikeped.errors import CaptureError
 from bikeped.types import Frame
@@ -304,7 +304,7 @@ async def test_a_paced_recording_runs_to_its_end_through_the_grabber(write_video
     path = write_video("a.avi", "MJPG")
     clock = Clock()
     grabber = FrameGrabber(
-        lambda: Paced(VideoSource(path), clock=clock, sleep=clock.sleep), clock=clock
+        lambda: PacedSource(VideoSource(path), clock=clock, sleep=clock.sleep), clock=clock
     )
     grabber.start()
     frames = []
@@ -340,7 +340,7 @@ class Recording(FrameSource):
 def test_a_paced_recording_keeps_its_spacing_on_the_live_clock():
     clock = Clock(50.0)
     recording = Recording([7.0, 7.1, 7.4])
-    with Paced(recording, clock=clock, sleep=clock.sleep) as source:
+    with PacedSource(recording, clock=clock, sleep=clock.sleep) as source:
         assert source.live
         assert (source.width, source.height, source.fps) == (96, 64, 10.0)
         seen = []
@@ -355,7 +355,7 @@ def test_a_paced_recording_keeps_its_spacing_on_the_live_clock():
 
 def test_a_late_frame_comes_at_once_and_looks_its_age():
     clock = Clock(50.0)
-    source = Paced(Recording([0.0, 0.1, 0.2]), clock=clock, sleep=clock.sleep)
+    source = PacedSource(Recording([0.0, 0.1, 0.2]), clock=clock, sleep=clock.sleep)
     source.read()
     clock.now_s += 1.0
     ages = [

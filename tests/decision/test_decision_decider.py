@@ -12,11 +12,11 @@ from bikeped.decision import (
     Decider,
     RuleSettings,
     TrackRows,
-    frames_with,
-    judge,
+    evaluate_rule,
+    frame_mask,
+    is_remembered,
     pair_rows,
-    remembered,
-    resolve,
+    resolve_state,
 )
 from bikeped.types import State
 
@@ -26,7 +26,7 @@ SELECTED = RuleSettings()
 
 def step(decider, t, tracks):
     ids = sorted(tracks)
-    return decider.step(
+    return decider.decide(
         t,
         np.array(ids, np.int64),
         np.array([tracks[i][0] for i in ids], np.int8),
@@ -90,7 +90,7 @@ def test_stages():
     for ped in flags:
         for cyc in flags:
             for near in flags:
-                (code,) = resolve(np.array([ped]), np.array([cyc]), np.array([near]))
+                (code,) = resolve_state(np.array([ped]), np.array([cyc]), np.array([near]))
                 if not ped:
                     expected = State.IDLE
                 elif not cyc:
@@ -98,8 +98,8 @@ def test_stages():
                 else:
                     expected = State.ALERT if near else State.WARNING
                 assert code == expected
-    assert remembered(np.array([1.0]), np.array([-math.inf]), 100.0).tolist() == [False]
-    assert frames_with(np.array([0, 2, 2]), 4).tolist() == [True, False, True, False]
+    assert is_remembered(np.array([1.0]), np.array([-math.inf]), 100.0).tolist() == [False]
+    assert frame_mask(np.array([0, 2, 2]), 4).tolist() == [True, False, True, False]
 
 
 def test_times_must_increase():
@@ -315,14 +315,14 @@ def rows_of(frames):
 def states_at_once(rule, frames):
     rows, count = rows_of(frames), len(frames)
     pairs = pair_rows(rows, count)
-    fires = judge(rows, pairs, rule).fires
+    fires = evaluate_rule(rows, pairs, rule).fires
     times = np.array([t for t, _ in frames])
-    cyclist = frames_with(rows.frame[rows.kind == CYCLIST], count)
+    cyclist = frame_mask(rows.frame[rows.kind == CYCLIST], count)
     last = np.maximum.accumulate(np.where(cyclist, times, -np.inf))
-    return resolve(
-        frames_with(rows.frame[rows.kind == PEDESTRIAN], count),
-        remembered(times, last, rule.memory_s),
-        frames_with(rows.frame[pairs.pedestrian_row[fires]], count),
+    return resolve_state(
+        frame_mask(rows.frame[rows.kind == PEDESTRIAN], count),
+        is_remembered(times, last, rule.memory_s),
+        frame_mask(rows.frame[pairs.pedestrian_row[fires]], count),
     ).tolist()
 
 
@@ -339,7 +339,7 @@ def test_frame_by_frame_equals_all_at_once_equals_the_plain_writing(rule, frames
 def test_the_numbers_are_the_same_too(rule, frames):
     rows = rows_of(frames)
     pairs = pair_rows(rows, len(frames))
-    verdicts = judge(rows, pairs, rule)
+    verdicts = evaluate_rule(rows, pairs, rule)
     frame = rows.frame[pairs.pedestrian_row]
     for f, decision in enumerate(run(rule, frames)):
         if decision.pair is None:

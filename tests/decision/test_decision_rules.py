@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.decision import Decider, RuleSettings, TrackRows, judge, pair_rows
+from bikeped.decision import Decider, RuleSettings, TrackRows, evaluate_rule, pair_rows
 from bikeped.types import State
 
 PEDESTRIAN, CYCLIST, VEHICLE = 0, 1, 2
@@ -23,7 +23,7 @@ def run(settings, frames):
 
 def step(decider, t, tracks):
     ids = sorted(tracks)
-    return decider.step(
+    return decider.decide(
         t,
         np.array(ids, np.int64),
         np.array([tracks[i][0] for i in ids], np.int8),
@@ -278,7 +278,7 @@ def test_no_rows_and_no_pairs():
     none = np.zeros(0, np.intp)
     rows = TrackRows(none, np.zeros(0), none, np.zeros(0, np.int8), np.zeros((0, 2)), none)
     for rule in RULES:
-        verdicts = judge(rows, pair_rows(rows, 3), replace(SELECTED, rule=rule))
+        verdicts = evaluate_rule(rows, pair_rows(rows, 3), replace(SELECTED, rule=rule))
         assert len(verdicts.fires) == 0
     one = TrackRows(
         np.zeros(1, np.intp), np.zeros(1), np.ones(1, np.intp), np.ones(1, np.int8),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bikeped.detection.partial_persons import drop_halves
+from bikeped.detection.partial_persons import suppress_partial_person_boxes
 from bikeped.types import Detections, Kind
 
 
@@ -22,7 +22,9 @@ HALF = (598, 11, 620, 47)
 
 
 def test_the_whole_stays_and_takes_the_greater_confidence():
-    left = drop_halves(found((Kind.PEDESTRIAN, 0.4, HALF), (Kind.PEDESTRIAN, 0.17, WHOLE)))
+    left = suppress_partial_person_boxes(
+        found((Kind.PEDESTRIAN, 0.4, HALF), (Kind.PEDESTRIAN, 0.17, WHOLE))
+    )
     assert left.box_px.tolist() == [list(WHOLE)]
     assert left.confidence.tolist() == pytest.approx([0.4])
 
@@ -38,9 +40,9 @@ def test_the_whole_stays_and_takes_the_greater_confidence():
 )
 def test_others_stay(other):
     both = found((Kind.PEDESTRIAN, 0.4, other), (Kind.PEDESTRIAN, 0.17, WHOLE))
-    assert len(drop_halves(both)) == 2
+    assert len(suppress_partial_person_boxes(both)) == 2
 
 
 def test_other_kinds_are_left_alone():
     both = found((Kind.VEHICLE, 0.4, HALF), (Kind.PEDESTRIAN, 0.17, WHOLE))
-    assert drop_halves(both) is both
+    assert suppress_partial_person_boxes(both) is both

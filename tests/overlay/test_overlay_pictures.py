@@ -22,14 +22,14 @@ from bikeped.types import (
     Decision,
     Detections,
     Kind,
-    PairNumbers,
+    PairMetrics,
     Signal,
     State,
     Tracks,
 )
 
 GREY = np.full((432, 768, 3), 120, np.uint8)
-PAIR = PairNumbers(12, 7, 10.9, 11.2, 0.067, 0.28, 4.3, 1.9, 24.8)
+PAIR = PairMetrics(12, 7, 10.9, 11.2, 0.067, 0.28, 4.3, 1.9, 24.8)
 
 
 def moment(state=State.ALERT, **changes):

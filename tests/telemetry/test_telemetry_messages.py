@@ -21,12 +21,12 @@ from hypothesis import strategies as st
 from bikeped.errors import TelemetryError
 from bikeped.telemetry import builders as m
 from bikeped.telemetry import json_schema as schemas
-from bikeped.types import Decision, Detections, PairNumbers, State, Tracks
+from bikeped.types import Decision, Detections, PairMetrics, State, Tracks
 
 DOCS = Path(__file__).parents[2] / "docs" / "messages"
 NOON = 1_767_268_800.0  # 2026-01-01T12:00:00Z
 
-PAIR = PairNumbers(
+PAIR = PairMetrics(
     cyclist_id=7,
     pedestrian_id=3,
     distance_m=4.56789,

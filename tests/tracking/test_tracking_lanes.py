@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.tracking import LaneTracker, TrackerSettings
+from bikeped.tracking import BatchTracker, TrackerSettings
 
 PEDESTRIAN, CYCLIST, VEHICLE = 0, 1, 2
 #: As the pole's configuration has it.
@@ -43,7 +43,7 @@ def slot_of(tracker, number):
 
 
 def test_birth_and_confirmation():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     feed(tracker, 0.0, (5, 0))
     assert present(tracker) == {}
     assert tracker.alive.sum() == 1
@@ -53,7 +53,7 @@ def test_birth_and_confirmation():
 
 
 def test_a_single_false_detection_never_counts_and_is_soon_forgotten():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     feed(tracker, 0.0, (5, 0))
     for i in range(1, 7):
         feed(tracker, i / 30)
@@ -64,7 +64,7 @@ def test_a_single_false_detection_never_counts_and_is_soon_forgotten():
 
 
 def test_a_lost_track_coasts_at_its_velocity_and_is_found_again():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     for i in range(31):
         feed(tracker, i / 30, (5, 5 * i / 30), kind=CYCLIST)
     for i in range(31, 61):
@@ -76,7 +76,7 @@ def test_a_lost_track_coasts_at_its_velocity_and_is_found_again():
 
 
 def test_dropped_after_10_seconds_and_not_before():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     feed(tracker, 0.0, (5, 0))
     feed(tracker, 1 / 30, (5, 0))
     for i in range(2, 302):
@@ -90,7 +90,7 @@ def test_dropped_after_10_seconds_and_not_before():
 
 
 def test_a_track_that_coasts_out_of_range_is_dropped():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     for i in range(30):
         feed(tracker, i / 30, (50 + 10 * i / 30, 0), kind=CYCLIST)
     assert present(tracker)
@@ -100,7 +100,7 @@ def test_a_track_that_coasts_out_of_range_is_dropped():
 
 @pytest.mark.parametrize("settings", [POLE, TrackerSettings()])
 def test_no_match_across_classes(settings):
-    tracker = LaneTracker(settings)
+    tracker = BatchTracker(settings)
     feed(tracker, 0.0, (5, 0, PEDESTRIAN))
     feed(tracker, 1 / 30, (5, 0, PEDESTRIAN))
     feed(tracker, 2 / 30, (5, 0, CYCLIST))
@@ -114,7 +114,7 @@ def test_no_match_across_classes(settings):
 
 
 def test_the_gate_refuses_a_jump_but_does_not_breed():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     for i in range(5):
         feed(tracker, i / 30, (5, 0))
     # 6 m/s * 1/30 s + 0.75 m = 0.95 m: 1.0 m is too far for one frame, but no second person.
@@ -128,7 +128,7 @@ def test_the_gate_refuses_a_jump_but_does_not_breed():
 
 
 def test_a_detection_beside_a_track_that_has_its_own_is_a_new_one():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     feed(tracker, 0.0, (5, 0))
     feed(tracker, 1 / 30, (5, 0), (5, 1.2))
     feed(tracker, 2 / 30, (5, 0), (5, 1.2))
@@ -137,18 +137,18 @@ def test_a_detection_beside_a_track_that_has_its_own_is_a_new_one():
 
 def test_the_gate_knows_the_class():
     for kind, far_enough in ((PEDESTRIAN, 0.9), (CYCLIST, 1.4), (VEHICLE, 2.0)):
-        tracker = LaneTracker(POLE)
+        tracker = BatchTracker(POLE)
         feed(tracker, 0.0, (5, 0), kind=kind)
         feed(tracker, 1 / 30, (5, far_enough), kind=kind)
         assert tracker.hits[0, 0] == 2
-        tracker = LaneTracker(POLE)
+        tracker = BatchTracker(POLE)
         feed(tracker, 0.0, (5, 0), kind=kind)
         feed(tracker, 1 / 30, (5, far_enough + 0.1), kind=kind)
         assert tracker.hits[0, 0] == 1  # 6, 20 or 40 m/s * 1/30 s + 0.75 m
 
 
 def test_no_velocity_beyond_the_classs_speed():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     feed(tracker, 0.0, (5, 0))
     feed(tracker, 1 / 30, (5, 0.9))  # 27 m/s in one step
     assert np.hypot(*tracker.velocity_mps[0, 0]) == pytest.approx(6.0)
@@ -156,11 +156,11 @@ def test_no_velocity_beyond_the_classs_speed():
 
 def test_farther_than_the_match_radius_is_somebody_else():
     for settings in (POLE, TrackerSettings()):
-        tracker = LaneTracker(settings)
+        tracker = BatchTracker(settings)
         feed(tracker, 0.0, (5, 0))
         feed(tracker, 1 / 30, (5, 3.01))
         assert tracker.alive.sum() == 2
-    tracker = LaneTracker(TrackerSettings())
+    tracker = BatchTracker(TrackerSettings())
     feed(tracker, 0.0, (5, 0))
     feed(tracker, 1 / 30, (5, 3.0))  # at the radius it still is the same
     assert tracker.alive.sum() == 1
@@ -170,7 +170,7 @@ def test_farther_than_the_match_radius_is_somebody_else():
 
 
 def test_dropped_frames_do_not_change_velocity_or_position():
-    every, third = LaneTracker(POLE), LaneTracker(POLE)
+    every, third = BatchTracker(POLE), BatchTracker(POLE)
     for i in range(61):
         feed(every, i / 30, (5, 0.1 * i), kind=CYCLIST)
         if i % 3 == 0:
@@ -184,7 +184,7 @@ def test_the_memory_of_the_smoothed_velocity_is_in_seconds():
     # At rest until 1 s, then 4 m/s: after n nominal frames 0.8^n of rest remains, however many
     # frames carried it.
     for gap in (1, 2, 5):
-        tracker = LaneTracker(replace(POLE, velocity_weight=0.2))
+        tracker = BatchTracker(replace(POLE, velocity_weight=0.2))
         for i in range(31):
             feed(tracker, i / 30, (5, 0), kind=CYCLIST)
         for i in range(30 + gap, 41, gap):
@@ -194,7 +194,7 @@ def test_the_memory_of_the_smoothed_velocity_is_in_seconds():
 
 def test_irregular_times():
     rng = np.random.default_rng(1)
-    t, tracker = 0.0, LaneTracker(POLE)
+    t, tracker = 0.0, BatchTracker(POLE)
     for _ in range(200):
         t += rng.choice([0.005, 1 / 30, 0.05, 0.2, 0.9])
         feed(tracker, t, (5 + 2 * t / 50, -20 + 0.5 * t))
@@ -203,7 +203,7 @@ def test_irregular_times():
 
 
 def test_time_must_not_go_back():
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     feed(tracker, 1.0)
     with pytest.raises(ValueError, match=r"0\.9 is before the last update at 1\.0"):
         feed(tracker, 0.9)
@@ -213,13 +213,13 @@ def test_time_must_not_go_back():
 
 
 def test_simulation_reports_from_the_first_detection():
-    tracker = LaneTracker(TrackerSettings())
+    tracker = BatchTracker(TrackerSettings())
     feed(tracker, 0.0, (5, 0))
     assert present(tracker) == {1: (5, 0)}
 
 
 def test_simulation_velocity_and_acceleration_are_exponential_means_from_zero():
-    tracker = LaneTracker(TrackerSettings())
+    tracker = BatchTracker(TrackerSettings())
     ys = [0.0, 0.3, 0.5, 0.9, 0.8, 1.6]
     velocity = acceleration = 0.0  # per frame, as the simulation counts
     for i, y in enumerate(ys):
@@ -233,7 +233,7 @@ def test_simulation_velocity_and_acceleration_are_exponential_means_from_zero():
 
 
 def test_simulation_has_no_speed_gate():
-    tracker = LaneTracker(TrackerSettings())
+    tracker = BatchTracker(TrackerSettings())
     feed(tracker, 0.0, (5, 0))
     feed(tracker, 1 / 30, (5, 2.9))
     assert present(tracker) == {1: (5, 2.9)}
@@ -241,7 +241,7 @@ def test_simulation_has_no_speed_gate():
 
 def test_simulation_removes_after_more_than_30_unseen_frames():
     for start in (0, 7, 1000):  # i / 30 rounds differently everywhere
-        tracker = LaneTracker(TrackerSettings())
+        tracker = BatchTracker(TrackerSettings())
         feed(tracker, start / 30, (5, 0))
         for i in range(1, 31):
             feed(tracker, (start + i) / 30)
@@ -251,7 +251,7 @@ def test_simulation_removes_after_more_than_30_unseen_frames():
 
 
 def test_simulation_keeps_a_track_that_returns_after_30_unseen_frames():
-    tracker = LaneTracker(TrackerSettings())
+    tracker = BatchTracker(TrackerSettings())
     feed(tracker, 0.0, (5, 0))
     for i in range(1, 31):
         feed(tracker, i / 30)
@@ -270,7 +270,7 @@ def crowd(seed, spacing, miss, layout):
         people = np.stack([np.full(10, 8.0), place * spacing - 4], axis=1)
     else:
         people = np.stack([8 + place // 5 * spacing, place % 5 * spacing - 4], axis=1)
-    tracker = LaneTracker(POLE)
+    tracker = BatchTracker(POLE)
     for frame in range(300):
         xy = people + rng.normal(0, 0.1, people.shape)
         xy = rng.permutation(xy[rng.random(10) >= miss])
@@ -303,8 +303,8 @@ def test_ten_people_of_whom_a_quarter_is_missed_never_become_eleven(spacing, lay
 def test_lanes_together_equal_each_alone(settings):
     rng = np.random.default_rng(3)
     lanes, places = 5, 12
-    together = LaneTracker(settings, lanes, slots=2)
-    alone = [LaneTracker(settings, 1, slots=2) for _ in range(lanes)]
+    together = BatchTracker(settings, lanes, slots=2)
+    alone = [BatchTracker(settings, 1, slots=2) for _ in range(lanes)]
     home = rng.uniform(-10, 10, (lanes, places, 2))
     kind_of = rng.integers(0, 3, (lanes, places)).astype(np.int8)
     for frame in range(80):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.tracking import LaneTracker, TrackerSettings
+from bikeped.tracking import BatchTracker, TrackerSettings
 from bikeped.tracking.matching import match_greedy
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=150)
@@ -73,7 +73,7 @@ GATED = TrackerSettings(
 def test_the_tracker_matches_as_the_plain_loop_does(tracker_settings, seed):
     """Half-metre positions, so that many distances tie; every frame is matched anew by hand."""
     rng = np.random.default_rng(seed)
-    tracker = LaneTracker(tracker_settings)
+    tracker = BatchTracker(tracker_settings)
     reach = tracker_settings.max_speed_mps
     ties = 0
     for frame in range(60):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bikeped.tracking import LaneTracker, TrackerSettings
+from bikeped.tracking import BatchTracker, TrackerSettings
 
 RAW = TrackerSettings(velocity_weight=0.2, unbiased=True, max_unseen_s=10.0)
 CALM = replace(RAW, position_weight=0.5)
@@ -17,7 +17,7 @@ CALM = replace(RAW, position_weight=0.5)
 
 def follow(settings: TrackerSettings, seen: np.ndarray, frames: list[int] | None = None):
     """Positions [n, 2] of the one track that follows `seen` [n, 2], at these frame numbers."""
-    tracker = LaneTracker(settings)
+    tracker = BatchTracker(settings)
     positions = []
     for frame, xy in zip(frames or range(len(seen)), seen, strict=True):
         tracker.update(frame / 30, xy.reshape(1, 1, 2), np.zeros((1, 1), np.int8))

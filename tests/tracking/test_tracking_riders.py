@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.tracking import LaneTracker, TrackerSettings
+from bikeped.tracking import BatchTracker, TrackerSettings
 from bikeped.types import Kind
 
 P, C, V = int(Kind.PEDESTRIAN), int(Kind.CYCLIST), int(Kind.VEHICLE)
@@ -23,19 +23,19 @@ SETTINGS = TrackerSettings(
 WHOLE = replace(SETTINGS, riders_whole=True)
 
 
-def feed(tracker: LaneTracker, frame: int, *detections: tuple[int, float, float]) -> None:
+def feed(tracker: BatchTracker, frame: int, *detections: tuple[int, float, float]) -> None:
     xy = np.asarray([[x, y] for _, x, y in detections]).reshape(1, -1, 2)
     kind = np.asarray([[k for k, _, _ in detections]], np.int8).reshape(1, -1)
     tracker.update(frame / 30, xy, kind)
 
 
-def kinds(tracker: LaneTracker) -> dict[int, int]:
+def kinds(tracker: BatchTracker) -> dict[int, int]:
     alive = tracker.alive[0]
     return dict(zip(tracker.id[0][alive].tolist(), tracker.kind[0][alive].tolist(), strict=True))
 
 
 def test_a_flickering_rider_stays_one_cyclist():
-    tracker = LaneTracker(SETTINGS)
+    tracker = BatchTracker(SETTINGS)
     rng = np.random.default_rng(3)
     for frame in range(120):
         cycle_seen = frame < 3 or rng.random() < 0.4
@@ -44,35 +44,35 @@ def test_a_flickering_rider_stays_one_cyclist():
 
 
 def test_a_rider_first_taken_for_a_walker_becomes_a_cyclist_without_leaving_a_ghost():
-    tracker = LaneTracker(SETTINGS)
+    tracker = BatchTracker(SETTINGS)
     for frame in range(20):
         feed(tracker, frame, (P if frame < 10 else C, 4.0 * frame / 30, 5.0))
     assert kinds(tracker) == {1: C}
 
 
 def test_one_false_bicycle_does_not_make_a_walker_a_cyclist():
-    tracker = LaneTracker(SETTINGS)
+    tracker = BatchTracker(SETTINGS)
     for frame in range(60):
         feed(tracker, frame, (C if frame == 30 else P, 1.3 * frame / 30, 5.0))
         assert kinds(tracker) == {1: P}
 
 
 def test_who_gets_off_and_walks_is_a_pedestrian_again():
-    tracker = LaneTracker(SETTINGS)
+    tracker = BatchTracker(SETTINGS)
     for frame in range(30 + 90):
         feed(tracker, frame, (C if frame < 30 else P, 1.3 * frame / 30, 5.0))
     assert kinds(tracker) == {1: P}
 
 
 def test_a_pedestrian_beside_a_cyclist_who_is_seen_keeps_a_track_of_their_own():
-    tracker = LaneTracker(SETTINGS)
+    tracker = BatchTracker(SETTINGS)
     for frame in range(30):
         feed(tracker, frame, (C, 0.0, 5.0), (P, 0.6, 5.0))
     assert sorted(kinds(tracker).values()) == [P, C]
 
 
 def test_a_person_farther_than_a_rider_can_be_is_new():
-    tracker = LaneTracker(SETTINGS)
+    tracker = BatchTracker(SETTINGS)
     for frame in range(5):
         feed(tracker, frame, (C, 0.0, 5.0))
     feed(tracker, 5, (P, 1.5, 5.0))
@@ -81,7 +81,7 @@ def test_a_person_farther_than_a_rider_can_be_is_new():
 
 def test_vehicles_and_the_simulation_are_left_alone():
     for settings, first, then in ((SETTINGS, V, P), (TrackerSettings(), C, P)):
-        tracker = LaneTracker(settings)
+        tracker = BatchTracker(settings)
         for frame in range(5):
             feed(tracker, frame, (first, 0.0, 5.0))
         feed(tracker, 5, (then, 0.2, 5.0))
@@ -90,7 +90,7 @@ def test_vehicles_and_the_simulation_are_left_alone():
 
 @pytest.mark.parametrize("wrong_frames", [1, 3, 10])
 def test_where_riders_are_whole_a_walker_first_taken_for_a_cyclist_is_soon_a_walker(wrong_frames):
-    tracker = LaneTracker(WHOLE)
+    tracker = BatchTracker(WHOLE)
     wrong = 0
     for frame in range(60):
         kind = C if frame < wrong_frames else P
@@ -105,7 +105,7 @@ def test_where_riders_are_whole_a_walker_first_taken_for_a_cyclist_is_soon_a_wal
 def test_where_riders_are_whole_the_most_frequent_kind_is_the_tracks():
     for share, expected in ((0.2, P), (0.8, C)):
         rng = np.random.default_rng(5)
-        tracker = LaneTracker(WHOLE)
+        tracker = BatchTracker(WHOLE)
         called = []
         for frame in range(200):
             feed(tracker, frame, (C if rng.random() < share else P, 3.0 * frame / 30, 5.0))
@@ -115,7 +115,7 @@ def test_where_riders_are_whole_the_most_frequent_kind_is_the_tracks():
 
 
 def test_where_riders_are_whole_two_people_stay_two():
-    tracker = LaneTracker(WHOLE)
+    tracker = BatchTracker(WHOLE)
     for frame in range(30):
         feed(tracker, frame, (C, 0.0, 5.0), (P, 0.6, 5.0))
     assert sorted(kinds(tracker).values()) == [P, C]

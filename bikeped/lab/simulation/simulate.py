@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bikeped.decision import (
+    PairChecks,
     Pairs,
-    PairVerdicts,
     RuleSettings,
     TrackRows,
-    frames_with,
-    judge,
+    evaluate_rule,
+    frame_mask,
+    is_remembered,
     pair_rows,
-    remembered,
-    resolve,
+    resolve_state,
 )
-from bikeped.tracking import LaneTracker, TrackerSettings, predict
+from bikeped.tracking import BatchTracker, TrackerSettings, predict
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
 
 FPS = 30.0
@@ -78,7 +78,7 @@ def track(scenes: Sequence[Scene], settings: TrackerSettings = SIMULATION_TRACKE
         there = scene.detected[:count]
         xy[late : late + count, lane, :width] = np.where(there[..., None], scene.xy_m[:count], 0.0)
         kind[late : late + count, lane, :width] = np.where(there, scene.kind, -1)
-    tracker = LaneTracker(settings, lanes, slots=max(2 * agents, 4))
+    tracker = BatchTracker(settings, lanes, slots=max(2 * agents, 4))
     history = _history(longest, tracker)
     for frame in range(longest):
         tracker.update(frame / FPS, xy[frame], kind[frame])
@@ -130,7 +130,7 @@ def delayed(tracked: Tracked, frames: int) -> Tracked:
     )
 
 
-def _arrays(tracker: LaneTracker) -> tuple[np.ndarray, ...]:  # type: ignore[type-arg]
+def _arrays(tracker: BatchTracker) -> tuple[np.ndarray, ...]:  # type: ignore[type-arg]
     """What is kept of every frame, in the order of `Tracked`."""
     return (
         tracker.reported,
@@ -142,7 +142,7 @@ def _arrays(tracker: LaneTracker) -> tuple[np.ndarray, ...]:  # type: ignore[typ
     )
 
 
-def _history(frames: int, tracker: LaneTracker) -> list[np.ndarray]:  # type: ignore[type-arg]
+def _history(frames: int, tracker: BatchTracker) -> list[np.ndarray]:  # type: ignore[type-arg]
     """Room for every frame; made again, wider, when the tracker's slots have grown."""
     return [np.zeros((frames, *a.shape), a.dtype) for a in _arrays(tracker)]
 
@@ -201,7 +201,7 @@ def rows_of(tracked: Tracked, order: int = 0) -> Run:
         previous=np.where(same, before, -1),
     )
     time_s = np.concatenate([np.arange(n) / FPS for n in tracked.frames])
-    cyclist = frames_with(rows.frame[rows.kind == int(Kind.CYCLIST)], total)
+    cyclist = frame_mask(rows.frame[rows.kind == int(Kind.CYCLIST)], total)
     last = np.where(cyclist, time_s, -np.inf)
     for begin, count in zip(start, tracked.frames, strict=True):
         part = last[begin : begin + count]
@@ -212,19 +212,19 @@ def rows_of(tracked: Tracked, order: int = 0) -> Run:
         start=start,
         frames=tracked.frames,
         time_s=time_s,
-        pedestrian=frames_with(rows.frame[rows.kind == int(Kind.PEDESTRIAN)], total),
+        pedestrian=frame_mask(rows.frame[rows.kind == int(Kind.PEDESTRIAN)], total),
         cyclist_last_s=last,
     )
 
 
-def verdicts(run: Run, settings: RuleSettings) -> PairVerdicts:
+def verdicts(run: Run, settings: RuleSettings) -> PairChecks:
     """What the rule says of every pair of every frame."""
-    return judge(run.rows, run.pairs, settings)
+    return evaluate_rule(run.rows, run.pairs, settings)
 
 
 def states(run: Run, settings: RuleSettings) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
     """State codes of every frame of every lane, lane after lane."""
     fired = verdicts(run, settings).fires
-    approaching = frames_with(run.rows.frame[run.pairs.pedestrian_row[fired]], len(run.time_s))
-    memory = remembered(run.time_s, run.cyclist_last_s, settings.memory_s)
-    return resolve(run.pedestrian, memory, approaching)
+    approaching = frame_mask(run.rows.frame[run.pairs.pedestrian_row[fired]], len(run.time_s))
+    memory = is_remembered(run.time_s, run.cyclist_last_s, settings.memory_s)
+    return resolve_state(run.pedestrian, memory, approaching)

@@ -194,7 +194,7 @@ def describe(work: Workbench, named: dict[str, DecisionConfig]) -> dict[str, Any
         "link": link_of(base, base),
         "configurations": named,
         "in_force": next(n for n, d in named.items() if d == base.decision),
-        "tests": TESTS,
+        "tests": list(TESTS),
         "tiers": TIERS,
         "hazards": HAZARDS,
         "kinds": SIZES_M,

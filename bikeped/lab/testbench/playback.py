@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.decision import PairVerdicts, chosen_pair, explain, pair_numbers, remembered
+from bikeped.decision import PairChecks, explain, is_remembered, pair_metrics, select_pair
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.experiments.deterministic import onsets
 from bikeped.lab.simulation.metrics import measure, number
@@ -46,7 +46,7 @@ def playback(
         "order": suite.delay.order,
         "sides": [_side(suite, index, name, d) for name, d in decisions.items()],
         "expected": scenario.expected,
-        "tests": TESTS,
+        "tests": list(TESTS),
     }
 
 
@@ -195,11 +195,11 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
     for i in range(len(own)):
         part = slice(int(start[i]), int(start[i + 1]))
         state = State(int(own[i]))
-        at = chosen_pair(state, found.fires[part], found.distance_m[part])
+        at = select_pair(state, found.fires[part], found.distance_m[part])
         pair = (
             None
             if at is None
-            else pair_numbers(part.start + at, run.rows, run.pairs, found, settings)
+            else pair_metrics(part.start + at, run.rows, run.pairs, found, settings)
         )
         sentences.append(explain(state, pair, int(walkers[i]), float(since[i]), settings))
         chosen.append(-1 if at is None else part.start + at - int(start[0]))
@@ -215,7 +215,7 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
         "chosen": chosen,
         "pedestrians": walkers.tolist(),
         "since_cyclist_s": _some(since),
-        "remembered": remembered(
+        "remembered": is_remembered(
             run.time_s[frames], run.cyclist_last_s[frames], settings.memory_s
         ).tolist(),
         "pairs": _pairs(suite, found, slice(int(start[0]), int(start[-1])), start),
@@ -245,14 +245,14 @@ def _counts(truth: Truth, alert: BoolArray) -> dict[str, int]:
     }
 
 
-def _pairs(suite: BenchSuite, found: PairVerdicts, part: slice, start: Any) -> dict[str, Any]:
+def _pairs(suite: BenchSuite, found: PairChecks, part: slice, start: Any) -> dict[str, Any]:
     """The numbers and the tests of every pair of every frame; `passes` holds a bit a test."""
     run = suite.run
     cyclist = run.pairs.cyclist_row[run.pairs.cyclist[part]]
     pedestrian = run.pairs.pedestrian_row[part]
     bits = np.zeros(len(cyclist), np.int64)
-    for bit, test in enumerate(TESTS):
-        bits |= getattr(found, test)[part].astype(np.int64) << bit
+    for bit, field in enumerate(TESTS.values()):
+        bits |= getattr(found, field)[part].astype(np.int64) << bit
     reach = np.maximum(np.hypot(*run.rows.xy_m[cyclist].T), np.hypot(*run.rows.xy_m[pedestrian].T))
     return {
         "start": (start - start[0]).tolist(),
@@ -269,16 +269,16 @@ def _pairs(suite: BenchSuite, found: PairVerdicts, part: slice, start: Any) -> d
     }
 
 
-#: Names of `PairVerdicts`, in the order of the bits of `passes`.
-TESTS = (
-    "in_range",
-    "far_enough",
-    "near_enough",
-    "judged",
-    "closing",
-    "enough",
-    "fires",
-)
+#: The tests of a pair by the bits of `passes`: name for the page, field of `PairChecks`.
+TESTS = {
+    "in_range": "in_range",
+    "far_enough": "above_d_min",
+    "near_enough": "below_d_max",
+    "judged": "evaluated",
+    "closing": "closing",
+    "enough": "displacement_ok",
+    "fires": "fires",
+}
 
 
 def _some(values: FloatArray) -> list[float | None]:

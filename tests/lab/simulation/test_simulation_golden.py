@@ -34,7 +34,7 @@ def trace(name, scene):
     for frame, there in enumerate(scene.detected):
         points = GroundPoints(scene.kind[there], scene.xy_m[frame][there], np.flatnonzero(there))
         tracks = tracker.update(points, frame / FPS)
-        decision = decider.step(frame / FPS, tracks.id, tracks.kind, tracks.xy_m)
+        decision = decider.decide(frame / FPS, tracks.id, tracks.kind, tracks.xy_m)
         pair = decision.pair
         key = decision.state.name, pair and (pair.cyclist_id, pair.pedestrian_id)
         distance = pair and pair.distance_m

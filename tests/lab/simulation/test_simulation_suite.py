@@ -34,7 +34,7 @@ def deployed(scene, rules, orders=(0,)):
         found.append([])
         for order, decider in zip(orders, deciders, strict=True):
             ahead = predict(tracks.xy_m, velocity, acceleration, scene.delay_frames / FPS, order)
-            decision = decider.step(frame / FPS, tracks.id, tracks.kind, ahead)
+            decision = decider.decide(frame / FPS, tracks.id, tracks.kind, ahead)
             found[-1].append(int(decision.state))
     return np.array(found, np.int8).T
 

@@ -125,7 +125,7 @@ def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
     decider, rows = Decider(rule_settings(decision)), one.run.rows
     for frame in range(play["frames"]):
         at = rows.frame == frame
-        told = decider.step(frame / 30, rows.id[at], rows.kind[at], rows.xy_m[at])
+        told = decider.decide(frame / 30, rows.id[at], rows.kind[at], rows.xy_m[at])
         assert side["sentence"][frame] == told.sentence
         assert State(side["state"][frame]) is told.state
         chosen = side["chosen"][frame]
