@@ -19,24 +19,45 @@ find_python() {
   exit 2
 }
 
-# ensure_env [EXTRA]: the virtual environment with bikeped and an extra of it, installed anew only
-# when what it is made from has changed.
-ensure_env() {
-  local extras=${1:-} wanted stamp spec
-  spec=.${extras:+[$extras]}
-  if [ ! -x .venv/bin/python ] || ! .venv/bin/python -c '' >/dev/null 2>&1; then
-    say "making .venv with $(find_python)"
-    "$(find_python)" -m venv --clear .venv
+# ensure_venv FOLDER: a virtual environment with a current pip.
+ensure_venv() {
+  if [ ! -x "$1/bin/python" ] || ! "$1/bin/python" -c '' >/dev/null 2>&1; then
+    say "making $1 with $(find_python)"
+    "$(find_python)" -m venv --clear "$1"
+    "$1/bin/python" -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=23.1'
   fi
-  wanted="$extras $(cat pyproject.toml scripts/constraints.txt | cksum) $(.venv/bin/python -V)"
-  stamp=.venv/.bikeped-${extras:-base}
+}
+
+# ensure_env [EXTRAS [FOLDER]]: the virtual environment (.venv) with bikeped and extras of it, installed
+# anew only when what it is made from has changed.
+ensure_env() {
+  local extras=${1:-} venv=${2:-.venv} wanted stamp
+  ensure_venv "$venv"
+  wanted="$extras $(cat pyproject.toml scripts/constraints.txt | cksum) $("$venv/bin/python" -V)"
+  stamp=$venv/.bikeped-${extras:-base}
   if [ ! -f "$stamp" ] || [ "$(cat "$stamp")" != "$wanted" ]; then
-    say "installing bikeped${extras:+[$extras]} into .venv"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=23.1'
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check \
-      --constraint scripts/constraints.txt --editable "$spec"
+    say "installing bikeped${extras:+[$extras]} into $venv"
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
+      --constraint scripts/constraints.txt --editable ".${extras:+[$extras]}"
     printf '%s' "$wanted" >"$stamp"
   fi
+}
+
+# ensure_cpu_torch FOLDER: PyTorch's CPU build in that virtual environment. On x86-64 the plain package
+# brings several gigabytes of CUDA libraries; elsewhere it is the CPU build.
+ensure_cpu_torch() {
+  local pin
+  ensure_venv "$1"
+  "$1/bin/python" -c 'import torch' >/dev/null 2>&1 && return
+  pin=$(grep '^torch==' scripts/constraints.txt)
+  [ "$(uname -m)" != x86_64 ] || pin="$pin+cpu"
+  say "installing $pin into $1"
+  "$1/bin/python" -m pip install --quiet --disable-pip-version-check \
+    --constraint scripts/constraints.txt "$pin" && return
+  say "pip finds no $pin. Name PyTorch's index of CPU builds in PIP_EXTRA_INDEX_URL (its install page has"
+  say "the address) or a folder with the wheel in PIP_FIND_LINKS, or accept the CUDA build:"
+  say "  $1/bin/python -m pip install --constraint scripts/constraints.txt torch"
+  exit 2
 }
 
 # ensure_tool COMMAND PACKAGE: a system tool that a test needs, from the distribution's packages.
