@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import html
 import logging
 import re
 import time
@@ -18,6 +17,7 @@ from aiohttp import hdrs, web
 
 from bikeped import __version__
 from bikeped.errors import BikepedError
+from bikeped.templates import render
 from bikeped.web.security import (
     COOKIE,
     HEADERS,
@@ -34,10 +34,9 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: Files that all pages share, and those of the live and align pages.
-STATIC = Path(__file__).with_name("static")
+#: `static/` and `templates/` that all pages share, with those of the live and align pages.
+WEB_FOLDER = Path(__file__).parent
 _TYPES = {
-    ".html": "text/html",
     ".css": "text/css",
     ".js": "text/javascript",
     ".json": "application/json",
@@ -55,19 +54,21 @@ _BODY_S = 20.0  #: how long a body may take to arrive
 class Page:
     """A page: `path`, its `label` in the navigation, the `title` of its window.
 
-    `body` is a file of `static/`, the inside of <main>; `scripts` (modules) and `styles` are files
-    of `static/`, too, loaded after the common ones.
+    `template` is a file of `templates/`, the inside of <main>; `scripts` (modules) and `styles` are
+    files of `static/`, loaded after the common ones. `folder` holds `templates/` and `static/` of
+    the page's own, beside the common ones.
     """
 
     path: str
     label: str
     title: str
-    body: str
+    template: str
     scripts: Sequence[str] = ()
     styles: Sequence[str] = ()
+    folder: Path = WEB_FOLDER
 
 
-PAGES: web.AppKey[list[Page]] = web.AppKey("pages", list)
+_PAGES: web.AppKey[list[Page]] = web.AppKey("pages", list)
 _ACCESS: web.AppKey[Access] = web.AppKey("access", Access)
 _FILES: web.AppKey[dict[str, _File]] = web.AppKey("files", dict)
 
@@ -89,7 +90,7 @@ def make_pages(access: Access, *adders: Callable[[web.Application], None]) -> we
     app = web.Application(
         middlewares=[guard(access, login, failures), _errors], client_max_size=MAX_BODY
     )
-    app[PAGES], app[_ACCESS], app[_FILES] = [], access, _load_static(STATIC)
+    app[_PAGES], app[_ACCESS], app[_FILES] = [], access, _load_static(WEB_FOLDER)
     app.on_response_prepare.append(_harden)
     app.router.add_get("/static/{name:.+}", _static)
     app.router.add_get("/favicon.ico", _favicon)
@@ -103,21 +104,18 @@ def make_pages(access: Access, *adders: Callable[[web.Application], None]) -> we
     app.router.add_post("/logout", _log_out)
     for add in adders:
         add(app)
-    paths = [page.path for page in app[PAGES]]
+    paths = [page.path for page in app[_PAGES]]
     if paths and "/" not in paths:
         app.router.add_get("/", _to(paths[0]))
     return app
 
 
-def add_page(app: web.Application, page: Page, static: Path | None = None) -> None:
-    """Adds a page and its entry in the navigation.
-
-    `static`: a folder whose files are served below /static/ beside the common ones.
-    """
-    if static is not None:
-        app[_FILES].update(_load_static(static))
-    app[PAGES].append(page)
-    app[PAGES].sort(key=lambda p: _ORDER.index(p.path) if p.path in _ORDER else len(_ORDER))
+def add_page(app: web.Application, page: Page) -> None:
+    """Adds a page and its entry in the navigation; serves its static files below /static/."""
+    if page.folder != WEB_FOLDER:
+        app[_FILES].update(_load_static(page.folder))
+    app[_PAGES].append(page)
+    app[_PAGES].sort(key=lambda p: _ORDER.index(p.path) if p.path in _ORDER else len(_ORDER))
 
     async def show(request: web.Request) -> web.Response:
         if "token" in request.query:  # has done its work, and must not stay in sight
@@ -172,8 +170,9 @@ async def _harden(_request: web.Request, response: web.StreamResponse) -> None:
 
 
 def _load_static(folder: Path) -> dict[str, _File]:
-    """All files of a folder, by name: what is not here is not served, whatever the path."""
+    """The files of `folder`/static by name: what is not here is not served, whatever the path."""
     files = {}
+    folder = folder / "static"
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.suffix in _TYPES and not path.name.startswith("."):
             data = path.read_bytes()
@@ -185,7 +184,7 @@ def _load_static(folder: Path) -> dict[str, _File]:
 
 async def _static(request: web.Request) -> web.StreamResponse:
     file = request.app[_FILES].get(request.match_info["name"])
-    if file is None or file.content_type == "text/html":
+    if file is None:
         raise web.HTTPNotFound(text="There is no such file.")
     return _answer_file(request, file)
 
@@ -207,25 +206,18 @@ def _answer_file(request: web.Request, file: _File) -> web.StreamResponse:
 
 def _page(request: web.Request, page: Page, status: int = 200) -> web.Response:
     """`page` inside the common frame."""
-    files = request.app[_FILES]
-    links = ""
-    for entry in request.app[PAGES]:
-        here = ' aria-current="page"' if entry.path == page.path else ""
-        links += f'<a href="{html.escape(entry.path)}"{here}>{html.escape(entry.label)}</a>'
-    styles = "".join(f'<link rel="stylesheet" href="/static/{name}">' for name in page.styles)
-    scripts = "".join(
-        f'<script type="module" src="/static/{name}"></script>' for name in page.scripts
+    text = render(
+        "frame.html",
+        page.folder / "templates",
+        WEB_FOLDER / "templates",
+        pages=request.app[_PAGES],
+        path=page.path,
+        title=page.title,
+        template=page.template,
+        scripts=page.scripts,
+        styles=page.styles,
+        version=__version__,
     )
-    parts = {
-        "title": html.escape(page.title),
-        "nav": links,
-        "styles": styles,
-        "scripts": scripts,
-        "version": html.escape(__version__),
-        "body": files[page.body].data.decode(),
-    }
-    frame = files["frame.html"].data.decode()
-    text = re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], frame)
     return web.Response(status=status, text=text, content_type="text/html")
 
 
@@ -280,13 +272,8 @@ def _welcome(request: web.Request, access: Access, path: str) -> web.Response:
     Not by a redirect: a browser that came here from another site (a link in a mail) does not send a
     SameSite=Strict cookie along a chain that began there. A page of our own starts a new one.
     """
-    target = html.escape(_local(path), quote=True)
-    answer = web.Response(
-        text=f'<!doctype html><html lang="en"><head><title>Welcome</title>'
-        f'<meta http-equiv="refresh" content="0;url={target}"></head>'
-        f'<body><a href="{target}">Continue</a></body></html>',
-        content_type="text/html",
-    )
+    text = render("welcome.html", WEB_FOLDER / "templates", target=_local(path))
+    answer = web.Response(text=text, content_type="text/html")
     answer.set_cookie(
         COOKIE,
         access.new_cookie(time.time()),

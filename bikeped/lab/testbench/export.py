@@ -12,11 +12,11 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from markupsafe import Markup
 
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
@@ -36,9 +36,10 @@ from bikeped.lab.testbench.pages import configurations
 from bikeped.lab.testbench.playback import coverage, playback
 from bikeped.lab.testbench.run import BenchSuite, Workbench
 from bikeped.lab.testbench.settings import in_force
-from bikeped.web.server import STATIC as SHARED_STATIC
+from bikeped.templates import render
+from bikeped.web.server import WEB_FOLDER
 
-_STATIC = Path(__file__).with_name("static")
+_FOLDERS = (Path(__file__).parent, WEB_FOLDER)  #: with `static/` and `templates/`, own ones first
 #: In the order in which they need one another.
 _SCRIPTS = (
     "ui.js",
@@ -84,10 +85,10 @@ def make_report(
     return _page(found, data, suite, loaded, command)
 
 
-def _static_file(name: str) -> Path:
-    """A file of the test bench, or one that all pages share."""
-    own = _STATIC / name
-    return own if own.is_file() else SHARED_STATIC / name
+def _static(name: str) -> str:
+    """A script or style sheet of the test bench, or one that all pages share."""
+    files = (folder / "static" / name for folder in _FOLDERS)
+    return next(file for file in files if file.is_file()).read_text(encoding="utf-8")
 
 
 def _play(
@@ -140,42 +141,32 @@ def _page(
         "calibration_hash": str(loaded.calibration_hash),
         "command": command,
     }
-    tables = "".join(table_html(t) for result in found.values() for t in result.tables)
-    parts = {
-        "verdict": verdict_html(found),
-        "tested": tested_html(found, provenance),
-        "tables": tables,
-        "risks": risks_html(found, provenance),
-        "provenance": definitions_html(provenance),
-        "command": escape(command),
-        "decision": escape(json.dumps(msgspec.to_builtins(loaded.config.decision))),
-    }
-    body = _filled(_static_file("report.html").read_text(encoding="utf-8"), parts)
-    style = "\n".join(_static_file(name).read_text(encoding="utf-8") for name in _STYLES)
-    theme = _static_file("theme.js").read_text(encoding="utf-8")
-    script = bundle({name: _static_file(name).read_text(encoding="utf-8") for name in _SCRIPTS})
+    style = "\n".join(map(_static, _STYLES))
+    theme = _static("theme.js")
+    script = bundle({name: _static(name) for name in _SCRIPTS})
     policy = (
         "default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; "
         f"style-src {_hash(style)}; script-src {_hash(theme)} {_hash(script)}"
     )
     # Inside a script element only "<" can end it: as \\u003c it is the same JSON.
-    told = msgspec.json.encode(data).decode().replace("<", "\\u003c")
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        '<meta name="referrer" content="no-referrer">\n'
-        '<link rel="icon" href="data:,">\n'
-        f"<title>Does the crossing warn in time? bikeped {__version__}</title>\n"
-        f"<style>{style}</style>\n<script>{theme}</script>\n</head>\n<body>\n{body}\n"
-        f'<script type="application/json" id="data">{told}</script>\n'
-        f"<script>{script}</script>\n</body>\n</html>\n"
+    data_json = msgspec.json.encode(data).decode().replace("<", "\\u003c")
+    return render(
+        "report.html",
+        *(folder / "templates" for folder in _FOLDERS),
+        version=__version__,
+        policy=policy,
+        style=Markup(style),
+        theme=Markup(theme),
+        script=Markup(script),
+        data=Markup(data_json),
+        verdict=Markup(verdict_html(found)),
+        tested=Markup(tested_html(found, provenance)),
+        tables=Markup("".join(table_html(t) for result in found.values() for t in result.tables)),
+        risks=Markup(risks_html(found, provenance)),
+        provenance=Markup(definitions_html(provenance)),
+        command=command,
+        decision=json.dumps(msgspec.to_builtins(loaded.config.decision)),
     )
-
-
-def _filled(text: str, parts: Mapping[str, str]) -> str:
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text)
 
 
 def _hash(text: str) -> str:

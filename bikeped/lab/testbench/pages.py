@@ -51,6 +51,7 @@ PAGE = Page(
     "testbench.html",
     scripts=("testbench.js",),
     styles=("testbench.css",),
+    folder=Path(__file__).parent,
 )
 
 
@@ -121,7 +122,7 @@ def add_testbench(
             bench = parse_link(found.text, base)
         return json_answer({"bench": bench, "link": link_of(bench, base)})
 
-    add_page(app, PAGE, Path(__file__).with_name("static"))
+    add_page(app, PAGE)
     app.router.add_get("/testbench/about", tell)
     app.router.add_post("/testbench/scenario", scenario)
     app.router.add_post("/testbench/suite", suite)
