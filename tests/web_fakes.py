@@ -14,7 +14,7 @@ from bikeped.pipeline.detection_stage import Picture
 from bikeped.pipeline.loop import Outcome
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside
-from bikeped.telemetry.builders import Counters, HealthMessage, Part, health_message
+from bikeped.telemetry.builders import ComponentStatus, Counters, HealthMessage, health_message
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.types import Colour, Detections, Frame, Kind, Signal
 from bikeped.web.security import Access
@@ -70,10 +70,10 @@ def health(**changes: Any) -> HealthMessage:
         "uptime_s": 3725.0,
         "fps": 29.9,
         "latency_ms": {"total": {"p50": 12.0, "p95": 20.0, "p99": 30.0, "max": 44.0}},
-        "camera": Part(ok=True, detail="frames arrive"),
+        "camera": ComponentStatus(ok=True, detail="frames arrive"),
         "capture_age_ms": 23.0,
-        "detector": Part(ok=True, detail="answers"),
-        "light": Part(ok=True, detail="simulated"),
+        "detector": ComponentStatus(ok=True, detail="answers"),
+        "light": ComponentStatus(ok=True, detail="simulated"),
         "faults": (),
         "counters": Counters(
             frames=100, dropped=2, undecodable=1, alerts=1, mqtt_dropped=0, audit_dropped=0

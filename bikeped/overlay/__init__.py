@@ -1,19 +1,19 @@
 """Pictures for people: the camera's view with what was found, and a bird's-eye radar.
 
-Pure functions over the stage types; only `VideoSink` touches the disk.
+Pure functions over the stage types; only `VideoWriter` touches the disk.
 """
 
 from bikeped.overlay.camera_view import draw_banner, draw_overlay
 from bikeped.overlay.compose import compose, encode_jpeg
-from bikeped.overlay.overlay_data import GroundToFrame, Moment, ground_projector
-from bikeped.overlay.radar import RadarFrame, draw_radar
-from bikeped.overlay.video_writer import VideoSink
+from bikeped.overlay.overlay_data import GroundToFrame, OverlayData, ground_projector
+from bikeped.overlay.radar import RadarProjection, draw_radar
+from bikeped.overlay.video_writer import VideoWriter
 
 __all__ = [
     "GroundToFrame",
-    "Moment",
-    "RadarFrame",
-    "VideoSink",
+    "OverlayData",
+    "RadarProjection",
+    "VideoWriter",
     "compose",
     "draw_banner",
     "draw_overlay",

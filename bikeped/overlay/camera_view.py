@@ -24,7 +24,7 @@ from bikeped.overlay.drawing import (
     text_size,
     wrap_text,
 )
-from bikeped.overlay.overlay_data import GroundToFrame, Moment
+from bikeped.overlay.overlay_data import GroundToFrame, OverlayData
 from bikeped.types import FloatArray, ImageArray, Kind
 
 #: A coasting track is drawn as a ring of this radius lying on the ground.
@@ -35,7 +35,7 @@ UNSEEN_RANGE_M = 40.0
 
 def draw_overlay(
     rgb: ImageArray,
-    moment: Moment,
+    data: OverlayData,
     *,
     scale: float = 1.0,
     ground_to_frame: GroundToFrame | None = None,
@@ -52,31 +52,31 @@ def draw_overlay(
     size = _text_height(w, h)
     top = _banner_height(w, h) if banner else 0
     bounds: Rect = (2, top + 2, w - 2, h - 2)
-    footer = _footer_rect(moment, size, bounds)
+    footer = _footer_rect(data, size, bounds)
     taken: list[Rect] = [footer]
     labels: list[tuple[str, Rect, Rgb]] = []
 
-    boxes = moment.detections.box_px.astype(np.float64) * scale
-    rows = moment.pair_rows()
-    ends = _pair_points(moment, rows, boxes, scale, ground_to_frame)
+    boxes = data.detections.box_px.astype(np.float64) * scale
+    rows = data.pair_rows()
+    ends = _pair_points(data, rows, boxes, scale, ground_to_frame)
     if ends is not None:
-        _draw_pair(image, ends, _pair_colour(moment), size)
-    _draw_unseen(image, moment, scale, ground_to_frame, size, labels)
-    _draw_boxes(image, moment, boxes, rows, size, labels)
-    _draw_distance(image, moment, ends, taken, bounds, size)
+        _draw_pair(image, ends, _pair_colour(data), size)
+    _draw_unseen(image, data, scale, ground_to_frame, size, labels)
+    _draw_boxes(image, data, boxes, rows, size, labels)
+    _draw_distance(image, data, ends, taken, bounds, size)
     shown = [label for label in labels if overlap(label[1], (0, 0, w, h)) > 0]
     avoid = [box for _, box, _ in shown]
     for text, box, colour in shown:
         _draw_label(image, text, box, colour, taken, avoid, bounds, size)
-    _draw_footer(image, moment, footer, size)
+    _draw_footer(image, data, footer, size)
     if banner:
-        draw_banner(image, moment, (0, 0, w, top))
+        draw_banner(image, data, (0, 0, w, top))
     return image
 
 
-def draw_banner(image: ImageArray, moment: Moment, rect: Rect) -> None:
+def draw_banner(image: ImageArray, data: OverlayData, rect: Rect) -> None:
     """The state's name and the reason for it, on the light's colour, into `rect` of `image`."""
-    name = moment.shown_name
+    name = data.shown_name
     colour = SIGNAL_COLOUR.get(name, SIGNAL_COLOUR["OFF"])
     x0, y0, x1, y1 = rect
     tall = y1 - y0
@@ -96,27 +96,27 @@ def draw_banner(image: ImageArray, moment: Moment, rect: Rect) -> None:
         ink = readable_on(colour)
         draw_text(image, name, (x0 + pad, y0 + (tall - big) / 2), big, ink, bold=True)
         left = x0 + wide + pad
-        rule = moment.decision.state.name
+        rule = data.decision.state.name
         if rule != name and name != "OFF":
-            # The light holds ALERT for a moment; say so instead of seeming to contradict the rule.
+            # The light holds ALERT for a while; say so instead of seeming to contradict the rule.
             note = f"rule now: {rule}"
             room = text_size(note, small)[0] + pad
             draw_text(
                 image, note, (x1 - pad, y0 + (tall - small) / 2), small, PAPER, anchor="right"
             )
             x1 -= room
-    lines = wrap_text(_reason(moment), small, x1 - pad - left, 2)
+    lines = wrap_text(_reason(data), small, x1 - pad - left, 2)
     step = small * 1.7
     first = y0 + (tall - small - step * (len(lines) - 1)) / 2
     for i, words in enumerate(lines):
         draw_text(image, words, (left, first + i * step), small, PAPER)
 
 
-def _reason(moment: Moment) -> str:
+def _reason(data: OverlayData) -> str:
     """The sentence without the state's name in front, which stands beside it already."""
-    head, colon, rest = moment.sentence.partition(": ")
-    if not colon or head != moment.decision.state.name:
-        return moment.sentence
+    head, colon, rest = data.sentence.partition(": ")
+    if not colon or head != data.decision.state.name:
+        return data.sentence
     return rest[:1].upper() + rest[1:]
 
 
@@ -129,20 +129,20 @@ def _banner_height(w: int, h: int) -> int:
     return int(np.clip(round(min(h, w * 9 / 16) * 0.085), 30, 96))
 
 
-def _pair_colour(moment: Moment) -> Rgb:
-    return SIGNAL_COLOUR["ALERT" if moment.alerting else "WARNING"]
+def _pair_colour(data: OverlayData) -> Rgb:
+    return SIGNAL_COLOUR["ALERT" if data.alerting else "WARNING"]
 
 
 def _draw_boxes(
     image: ImageArray,
-    moment: Moment,
+    data: OverlayData,
     boxes: FloatArray,
     rows: tuple[int, int] | None,
     size: int,
     labels: list[tuple[str, Rect, Rgb]],
 ) -> None:
     """Boxes, small ones over large ones; adds their labels, those of the pair first."""
-    tracks = moment.tracks
+    tracks = data.tracks
     row_of = {int(d): i for i, d in enumerate(tracks.detection) if d >= 0}
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     line = max(round(size / 6), 2)
@@ -151,10 +151,10 @@ def _draw_boxes(
         x0, y0, x1, y1 = boxes[d].tolist()
         box: Rect = (x0, y0, x1, y1)
         row = row_of.get(d)
-        kind = Kind(int(moment.detections.kind[d]))
+        kind = Kind(int(data.detections.kind[d]))
         colour = KIND_COLOUR[kind]
         judged = row is not None and rows is not None and row in rows
-        if judged and moment.alerting:
+        if judged and data.alerting:
             halo = line * 2 + 1
             wide: Rect = (x0 - halo, y0 - halo, x1 + halo, y1 + halo)
             outline(image, wide, PAPER, line + 3)
@@ -163,7 +163,7 @@ def _draw_boxes(
         outline(image, (x0, y0, x1, y1), INK, line + 2)
         outline(image, (x0, y0, x1, y1), colour, line)
         if row is None:
-            text = f"{kind.label} {moment.detections.confidence[d]:.2f}"
+            text = f"{kind.label} {data.detections.confidence[d]:.2f}"
             colour = shade(colour, 0.7)
         else:
             speed = float(np.hypot(*tracks.velocity_mps[row]))
@@ -176,7 +176,7 @@ def _draw_boxes(
 
 def _draw_unseen(
     image: ImageArray,
-    moment: Moment,
+    data: OverlayData,
     scale: float,
     ground_to_frame: GroundToFrame | None,
     size: int,
@@ -185,7 +185,7 @@ def _draw_unseen(
     """A dashed ring on the ground where each track without a detection is believed to be."""
     if ground_to_frame is None:
         return
-    tracks = moment.tracks
+    tracks = data.tracks
     turn = np.linspace(0, 2 * np.pi, 49)
     ring = RING_M * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     near = np.hypot(tracks.xy_m[:, 0], tracks.xy_m[:, 1]) <= UNSEEN_RANGE_M
@@ -207,7 +207,7 @@ def _draw_unseen(
 
 
 def _pair_points(
-    moment: Moment,
+    data: OverlayData,
     rows: tuple[int, int] | None,
     boxes: FloatArray,
     scale: float,
@@ -216,7 +216,7 @@ def _pair_points(
     """The pair line in pixels [n, 2]: straight on the ground, hence bent in a fisheye picture."""
     if rows is None:
         return None
-    tracks = moment.tracks
+    tracks = data.tracks
     if ground_to_frame is not None:
         part = np.linspace(0, 1, 25)[:, None]
         way = tracks.xy_m[rows[0]] * (1 - part) + tracks.xy_m[rows[1]] * part
@@ -237,14 +237,14 @@ def _draw_pair(image: ImageArray, line: FloatArray, colour: Rgb, size: int) -> N
 
 def _draw_distance(
     image: ImageArray,
-    moment: Moment,
+    data: OverlayData,
     line: FloatArray | None,
     taken: list[Rect],
     bounds: Rect,
     size: int,
 ) -> None:
     """The pair's distance at the middle of its line."""
-    pair = moment.decision.pair
+    pair = data.decision.pair
     if line is None or pair is None:
         return
     shown = line[np.isfinite(line).all(axis=1)]
@@ -256,7 +256,7 @@ def _draw_distance(
     text = f"{pair.distance_m:.1f} m"
     w, h = text_size(text, height, True)[0] + height, height * 2
     rect: Rect = (u - w / 2, v - h / 2, u + w / 2, v + h / 2)
-    colour = _pair_colour(moment)
+    colour = _pair_colour(data)
     fill_rect(image, (rect[0] - 1, rect[1] - 1, rect[2] + 1, rect[3] + 1), INK)
     fill_rect(image, rect, colour)
     ink = readable_on(colour)
@@ -284,19 +284,19 @@ def _draw_label(
     )
 
 
-def _footer_text(moment: Moment) -> str:
-    parts = [moment.clock] if moment.clock else []
-    parts += [f"{moment.time_s:.2f} s", f"frame {moment.frame_number}"]
-    if moment.latency_s is not None:
-        parts.append(f"latency {moment.latency_s * 1000:.0f} ms")
+def _footer_text(data: OverlayData) -> str:
+    parts = [data.clock] if data.clock else []
+    parts += [f"{data.time_s:.2f} s", f"frame {data.frame_number}"]
+    if data.latency_s is not None:
+        parts.append(f"latency {data.latency_s * 1000:.0f} ms")
     return "   ".join(parts)
 
 
-def _footer_rect(moment: Moment, size: int, bounds: Rect) -> Rect:
-    width = text_size(_footer_text(moment), size)[0] + 2 * size
+def _footer_rect(data: OverlayData, size: int, bounds: Rect) -> Rect:
+    width = text_size(_footer_text(data), size)[0] + 2 * size
     return (0, bounds[3] + 2 - 2.2 * size, float(width), bounds[3] + 2)
 
 
-def _draw_footer(image: ImageArray, moment: Moment, rect: Rect, size: int) -> None:
+def _draw_footer(image: ImageArray, data: OverlayData, rect: Rect, size: int) -> None:
     fill_rect(image, rect, INK, 0.72)
-    draw_text(image, _footer_text(moment), (size, rect[1] + 0.6 * size), size, PAPER)
+    draw_text(image, _footer_text(data), (size, rect[1] + 0.6 * size), size, PAPER)

@@ -8,7 +8,7 @@ import simplejpeg
 
 from bikeped.overlay.camera_view import draw_banner, draw_overlay
 from bikeped.overlay.drawing import INK
-from bikeped.overlay.overlay_data import GroundToFrame, Moment
+from bikeped.overlay.overlay_data import GroundToFrame, OverlayData
 from bikeped.overlay.radar import draw_radar
 from bikeped.types import ImageArray
 
@@ -18,7 +18,7 @@ _PICTURE = 0.705
 
 def compose(
     rgb: ImageArray,
-    moment: Moment,
+    data: OverlayData,
     size: tuple[int, int] = (1600, 720),
     *,
     frame_width: int | None = None,
@@ -42,7 +42,7 @@ def compose(
     small = np.asarray(cv2.resize(rgb, (pw, ph), interpolation=how), dtype=np.uint8)
     picture = draw_overlay(
         small,
-        moment,
+        data,
         scale=pw / (frame_width or w),
         ground_to_frame=ground_to_frame,
         banner=False,
@@ -52,19 +52,19 @@ def compose(
     y = top + (height - top - ph) // 2
     out[y : y + ph, (left - pw) // 2 : (left - pw) // 2 + pw] = picture
     out[top:, left:] = draw_radar(
-        moment,
+        data,
         (width - left, height - top),
         range_m=range_m,
         fov_deg=fov_deg,
         heading_deg=heading_deg,
     )
-    draw_banner(out, moment, (0, 0, width, top))
+    draw_banner(out, data, (0, 0, width, top))
     return out
 
 
 def encode_jpeg(rgb: ImageArray, quality: int = 85) -> bytes:
     """`rgb` [h, w, 3] as a JPEG file."""
-    data: bytes = simplejpeg.encode_jpeg(
+    jpeg: bytes = simplejpeg.encode_jpeg(
         np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420"
     )
-    return data
+    return jpeg

@@ -15,7 +15,7 @@ GroundToFrame = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
-class Moment:
+class OverlayData:
     """One frame's results. `history` maps a track id to its last positions [n, 2], oldest first."""
 
     detections: Detections

@@ -28,7 +28,7 @@ from bikeped.overlay.drawing import (
     shade,
     text_size,
 )
-from bikeped.overlay.overlay_data import Moment
+from bikeped.overlay.overlay_data import OverlayData
 from bikeped.types import FloatArray, ImageArray, Kind
 
 RING_STEP_M = 5.0
@@ -43,7 +43,7 @@ _BEHIND = 0.2
 
 
 @dataclass(frozen=True)
-class RadarFrame:
+class RadarProjection:
     """Where ground metres lie in a radar picture of `width` x `height` pixels."""
 
     width: int
@@ -54,14 +54,14 @@ class RadarFrame:
     px_per_m: float
 
     @staticmethod
-    def fit(width: int, height: int, range_m: float = 25.0) -> RadarFrame:
+    def fit(width: int, height: int, range_m: float = 25.0) -> RadarProjection:
         """The largest radar that fits, `range_m` ahead and to both sides, a fifth of it behind."""
         margin = max(round(min(width, height) * 0.03), 6)
         side = (width / 2 - margin) / range_m
         tall = (height - 2 * margin) / (range_m * (1 + _BEHIND))
         scale = min(side, tall)
         top = margin + max(0.0, (tall - scale) * range_m * (1 + _BEHIND)) * 0.25
-        return RadarFrame(width, height, range_m, width / 2, top + scale * range_m, scale)
+        return RadarProjection(width, height, range_m, width / 2, top + scale * range_m, scale)
 
     def pixels(self, xy_m: npt.ArrayLike) -> FloatArray:
         """Radar pixels [..., 2] of camera ground positions [..., 2] (x forward, y right)."""
@@ -72,7 +72,7 @@ class RadarFrame:
 
 
 def draw_radar(
-    moment: Moment,
+    data: OverlayData,
     size: tuple[int, int],
     *,
     range_m: float = 25.0,
@@ -84,19 +84,19 @@ def draw_radar(
     `heading_deg`: the optical axis, to the right of the ground frame's x axis; it turns the
     field of view's wedge. Tracks beyond `range_m` are drawn as marks on the outermost ring.
     """
-    frame = RadarFrame.fit(size[0], size[1], range_m)
+    frame = RadarProjection.fit(size[0], size[1], range_m)
     image = _base(frame, fov_deg, heading_deg).copy()
     text = _text_height(size)
-    tracks = moment.tracks
-    rows = moment.pair_rows()
+    tracks = data.tracks
+    rows = data.pair_rows()
     reach = np.hypot(tracks.xy_m[:, 0], tracks.xy_m[:, 1])
     near = reach <= range_m
     taken: list[Rect] = []
     paired = rows if rows is not None and near[list(rows)].all() else None
 
-    _draw_trails(image, frame, moment.history, {int(i) for i in tracks.id[near]}, moment)
+    _draw_trails(image, frame, data.history, {int(i) for i in tracks.id[near]}, data)
     if paired is not None:
-        _draw_pair(image, frame, moment, paired)
+        _draw_pair(image, frame, data, paired)
     labels: list[tuple[bool, int, FloatArray]] = []
     for row in range(len(tracks)):
         kind = Kind(int(tracks.kind[row]))
@@ -106,7 +106,7 @@ def draw_radar(
             circle(image, rim, text * 0.35, shade(KIND_COLOUR[kind], 0.7))
             continue
         judged = rows is not None and row in rows
-        if judged and moment.alerting:
+        if judged and data.alerting:
             circle(image, at, text * 1.45, SIGNAL_COLOUR["ALERT"], max(round(text / 4), 2))
         velocity = tracks.velocity_mps[row]
         if np.hypot(*velocity) > 0.3:
@@ -116,11 +116,11 @@ def draw_radar(
         _symbol(image, kind, at, text * 0.62, heading, unseen=bool(tracks.detection[row] < 0))
         labels.append((judged, row, at))
     if paired is not None:
-        _draw_distance(image, frame, moment, paired, text, taken)
+        _draw_distance(image, frame, data, paired, text, taken)
     labels.sort(key=lambda item: not item[0])
     for _, row, at in labels:
-        _draw_label(image, moment, row, at, text, taken)
-    _draw_list(image, frame, moment, reach, text)
+        _draw_label(image, data, row, at, text, taken)
+    _draw_list(image, frame, data, reach, text)
     return image
 
 
@@ -129,7 +129,7 @@ def _text_height(size: tuple[int, int]) -> int:
 
 
 @functools.lru_cache(maxsize=8)
-def _base(frame: RadarFrame, fov_deg: float, heading_deg: float) -> ImageArray:
+def _base(frame: RadarProjection, fov_deg: float, heading_deg: float) -> ImageArray:
     """Rings, spokes, wedge and camera: the same in every frame, so drawn once."""
     image: ImageArray = np.empty((frame.height, frame.width, 3), np.uint8)
     image[:] = _GROUND
@@ -181,12 +181,12 @@ def _base(frame: RadarFrame, fov_deg: float, heading_deg: float) -> ImageArray:
 
 def _draw_trails(
     image: ImageArray,
-    frame: RadarFrame,
+    frame: RadarProjection,
     history: Mapping[int, FloatArray],
     present: set[int],
-    moment: Moment,
+    data: OverlayData,
 ) -> None:
-    kinds = dict(zip(moment.tracks.id.tolist(), moment.tracks.kind.tolist(), strict=True))
+    kinds = dict(zip(data.tracks.id.tolist(), data.tracks.kind.tolist(), strict=True))
     for number, trail in history.items():
         if number not in present or len(trail) < 2:
             continue
@@ -200,10 +200,12 @@ def _draw_trails(
             polyline(image, part, shade(colour, fade), 2)
 
 
-def _draw_pair(image: ImageArray, frame: RadarFrame, moment: Moment, rows: tuple[int, int]) -> None:
-    ends = frame.pixels(moment.tracks.xy_m[list(rows)])
-    colour = SIGNAL_COLOUR["ALERT" if moment.alerting else "WARNING"]
-    if moment.alerting:
+def _draw_pair(
+    image: ImageArray, frame: RadarProjection, data: OverlayData, rows: tuple[int, int]
+) -> None:
+    ends = frame.pixels(data.tracks.xy_m[list(rows)])
+    colour = SIGNAL_COLOUR["ALERT" if data.alerting else "WARNING"]
+    if data.alerting:
         polyline(image, ends, PAPER, 5)
         polyline(image, ends, colour, 3)
     else:
@@ -212,18 +214,18 @@ def _draw_pair(image: ImageArray, frame: RadarFrame, moment: Moment, rows: tuple
 
 def _draw_distance(
     image: ImageArray,
-    frame: RadarFrame,
-    moment: Moment,
+    frame: RadarProjection,
+    data: OverlayData,
     rows: tuple[int, int],
     text: int,
     taken: list[Rect],
 ) -> None:
     """The pair's distance on its line, above arrows and symbols."""
-    pair = moment.decision.pair
+    pair = data.decision.pair
     if pair is None:
         return
-    ends = frame.pixels(moment.tracks.xy_m[list(rows)])
-    colour = SIGNAL_COLOUR["ALERT" if moment.alerting else "WARNING"]
+    ends = frame.pixels(data.tracks.xy_m[list(rows)])
+    colour = SIGNAL_COLOUR["ALERT" if data.alerting else "WARNING"]
     word = f"{pair.distance_m:.1f} m"
     wide = text_size(word, text, True)[0] + text
     if np.hypot(*(ends[1] - ends[0])) < wide + 3 * text:
@@ -261,24 +263,24 @@ def _symbol(
 
 
 def _draw_label(
-    image: ImageArray, moment: Moment, row: int, at: FloatArray, text: int, taken: list[Rect]
+    image: ImageArray, data: OverlayData, row: int, at: FloatArray, text: int, taken: list[Rect]
 ) -> None:
-    word = str(moment.tracks.id[row])
+    word = str(data.tracks.id[row])
     reach = text * 1.1
     box: Rect = (at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach)
     h, w = image.shape[:2]
     size = (float(text_size(word, text, True)[0] + 4), text + 4.0)
     spot = place_label(size, box, taken, (0, 0, w, h), gap=0)
     taken.append(spot)
-    kind = Kind(int(moment.tracks.kind[row]))
+    kind = Kind(int(data.tracks.kind[row]))
     draw_text(image, word, (spot[0] + 2, spot[1] + 2), text, KIND_COLOUR[kind], bold=True)
 
 
 def _draw_list(
-    image: ImageArray, frame: RadarFrame, moment: Moment, reach: FloatArray, text: int
+    image: ImageArray, frame: RadarProjection, data: OverlayData, reach: FloatArray, text: int
 ) -> None:
     """The tracks in words below the radar, nearest first, as many as fit."""
-    tracks = moment.tracks
+    tracks = data.tracks
     top = frame.v0 + frame.range_m * frame.px_per_m * _BEHIND + text * 1.6
     line = text * 2.1
     room = int((frame.height - top - text * 0.6) / line)

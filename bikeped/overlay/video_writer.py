@@ -12,7 +12,7 @@ from bikeped.errors import CaptureError
 from bikeped.types import ImageArray
 
 
-class VideoSink:
+class VideoWriter:
     """Writes RGB pictures of one size to `path` (.mp4).
 
     Writes beside it under a temporary name and renames at `close`, so that a half-written file
@@ -46,7 +46,7 @@ class VideoSink:
             raise ValueError(f"{self.path}: is closed already")
         if rgb.shape != (self.size[1], self.size[0], 3):
             # OpenCV drops such a frame without a word.
-            raise ValueError(f"VideoSink: expected {self.size}, got shape {rgb.shape}")
+            raise ValueError(f"VideoWriter: expected {self.size}, got shape {rgb.shape}")
         self._writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
         self.frames += 1
 
@@ -73,7 +73,7 @@ class VideoSink:
             self._writer = None
         self._partial.unlink(missing_ok=True)
 
-    def __enter__(self) -> VideoSink:
+    def __enter__(self) -> VideoWriter:
         return self
 
     def __exit__(

@@ -20,7 +20,7 @@ LOG_EVERY_S = 60.0
 MEASURE_EVERY_S = 1.0
 
 
-async def tell_health(
+async def report_health(
     telemetry: Telemetry,
     loop: Loop,
     health: Callable[[], HealthMessage],

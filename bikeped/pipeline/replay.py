@@ -16,19 +16,19 @@ from bikeped.capture import FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback import LightDriver, SignalLogic, SimulatedLight
-from bikeped.overlay import VideoSink
+from bikeped.overlay import VideoWriter
 from bikeped.pipeline.detection_stage import Eye, ModelEye, Vision
 from bikeped.pipeline.factory import header_of, load_eye, start_publisher
 from bikeped.pipeline.feed import RecordedFeed
 from bikeped.pipeline.ground_mapper import Viewpoint
-from bikeped.pipeline.health_report import tell_health
+from bikeped.pipeline.health_report import report_health
 from bikeped.pipeline.loop import Loop, Output
 from bikeped.pipeline.replay_outputs import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
 from bikeped.pipeline.signal_dispatcher import Announcer
 from bikeped.pipeline.telemetry import Telemetry
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside, Pages, open_pages
-from bikeped.telemetry.builders import HealthMessage, Part
+from bikeped.telemetry.builders import ComponentStatus, HealthMessage
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
 
@@ -163,7 +163,7 @@ async def _replay(
         if files.overlay is not None:
             fps = source.fps if source.fps > 0 else 30.0
             overlay = OverlayVideo(
-                stack.enter_context(VideoSink(files.overlay, fps, OVERLAY_SIZE)), judge
+                stack.enter_context(VideoWriter(files.overlay, fps, OVERLAY_SIZE)), judge
             )
             outputs.append(overlay)
             stack.push_async_callback(overlay.wait)
@@ -184,7 +184,7 @@ async def _replay(
             outputs=outputs,
             looks_at_once=eye.at_once if isinstance(eye, ModelEye) else 1,
         )
-        part = Part(ok=True, detail="simulated")
+        part = ComponentStatus(ok=True, detail="simulated")
 
         def health() -> HealthMessage:
             return telemetry.health(loop, part)
@@ -205,7 +205,7 @@ async def _replay(
             if serving is not None:
                 serving(str(server.address))
         telling = asyncio.create_task(
-            tell_health(telemetry, loop, health, config.mqtt.health_interval_s)
+            report_health(telemetry, loop, health, config.mqtt.health_interval_s)
         )
         # Only now, when nothing more can be refused: an error is one line on its own.
         for text in warnings:

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.overlay import Moment, VideoSink, compose, ground_projector
+from bikeped.overlay import OverlayData, VideoWriter, compose, ground_projector
 from bikeped.pipeline.loop import Outcome
-from bikeped.pipeline.telemetry import line_of
+from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.telemetry.builders import EventHeader
 from bikeped.telemetry.events import EventWriter
@@ -66,7 +66,7 @@ class EventFile:
         self._writer = EventWriter(path, header)
 
     async def frame(self, outcome: Outcome) -> None:
-        self._writer.write(line_of(outcome))
+        self._writer.write(event_line_for(outcome))
 
     def __enter__(self) -> EventFile:
         return self
@@ -85,7 +85,7 @@ class EventFile:
 class OverlayVideo:
     """The overlay video of a replay: drawn in a thread, while the next frame is looked at."""
 
-    def __init__(self, sink: VideoSink, judge: Judge) -> None:
+    def __init__(self, sink: VideoWriter, judge: Judge) -> None:
         self._sink, self._judge = sink, judge
         self._fov_deg = math.degrees(2 * judge.viewpoint.camera.lens.max_theta_rad)
         self._drawing: asyncio.Task[None] | None = None
@@ -93,7 +93,7 @@ class OverlayVideo:
     async def frame(self, outcome: Outcome) -> None:
         await self.wait()
         frame, judgement = outcome.picture.frame, outcome.judgement
-        moment = Moment(
+        overlay_data = OverlayData(
             detections=outcome.detections,
             tracks=judgement.tracks,
             decision=judgement.decision,
@@ -109,7 +109,7 @@ class OverlayVideo:
             self._sink.write(
                 compose(
                     outcome.picture.rgb,
-                    moment,
+                    overlay_data,
                     self._sink.size,
                     frame_width=frame.width,
                     ground_to_frame=projector,

@@ -21,7 +21,7 @@ from bikeped.pipeline.detection_stage import Eye, Vision
 from bikeped.pipeline.factory import header_of, load_eye, start_publisher
 from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.ground_mapper import Viewpoint
-from bikeped.pipeline.health_report import tell_health
+from bikeped.pipeline.health_report import report_health
 from bikeped.pipeline.loop import Hung, Limits, Loop
 from bikeped.pipeline.signal_dispatcher import Announcer
 from bikeped.pipeline.systemd import Notifier
@@ -30,7 +30,7 @@ from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside, Pages, open_pages
 from bikeped.pipeline.worker_threads import Worker
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.builders import HealthMessage, Part
+from bikeped.telemetry.builders import ComponentStatus, HealthMessage
 from bikeped.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
@@ -137,7 +137,7 @@ async def _serve(
             faults.append(_about("audit", audit.fault))
         if light.fault:
             faults.append(_about("light", light.fault))
-        part = Part(ok=light.fault is None, detail=light.fault or config.feedback.light)
+        part = ComponentStatus(ok=light.fault is None, detail=light.fault or config.feedback.light)
         return telemetry.health(loop, part, tuple(faults))
 
     if pages is not None and metrics is not None:
@@ -154,7 +154,7 @@ async def _serve(
     tasks = (
         asyncio.create_task(_stop_when(stop, loop)),
         asyncio.create_task(
-            tell_health(
+            report_health(
                 telemetry, loop, health, config.mqtt.health_interval_s, lambda: light.errors
             )
         ),

@@ -16,10 +16,10 @@ from bikeped.pipeline.loop import Loop, Outcome
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import (
+    ComponentStatus,
     Counters,
     EventLine,
     HealthMessage,
-    Part,
     ShownState,
     encode,
     event_line,
@@ -76,7 +76,7 @@ class Telemetry:
                 latency_ms=outcome.latency_ms,
             )
         if self._audit is not None:
-            self._audit.write(line_of(outcome))
+            self._audit.write(event_line_for(outcome))
         if self._mqtt is not None and now_s >= self._next_tracks_s:
             self._next_tracks_s = self._due(now_s)
             message = tracks_message(
@@ -114,7 +114,9 @@ class Telemetry:
         now_s = self._clock()
         return sum(now_s - at_s <= 2.0 for at_s in self._recent) / 2.0
 
-    def health(self, loop: Loop, light: Part, faults: tuple[str, ...] = ()) -> HealthMessage:
+    def health(
+        self, loop: Loop, light: ComponentStatus, faults: tuple[str, ...] = ()
+    ) -> HealthMessage:
         """The health message now; `faults` are those that the light does not show."""
         signal = self._signal
         faults = (*(signal.faults if signal else ()), *faults)
@@ -133,9 +135,9 @@ class Telemetry:
             uptime_s=self._clock() - self._started_s,
             fps=self.fps(),
             latency_ms=self.times.percentiles(),
-            camera=Part(ok=not camera, detail="; ".join(camera) or "frames arrive"),
+            camera=ComponentStatus(ok=not camera, detail="; ".join(camera) or "frames arrive"),
             capture_age_ms=age_ms,
-            detector=Part(ok=not detector, detail="; ".join(detector) or "answers"),
+            detector=ComponentStatus(ok=not detector, detail="; ".join(detector) or "answers"),
             light=light,
             faults=faults,
             counters=Counters(
@@ -187,7 +189,7 @@ class Telemetry:
         return max(self._next_tracks_s + interval_s, now_s + interval_s / 2)
 
 
-def line_of(outcome: Outcome) -> EventLine:
+def event_line_for(outcome: Outcome) -> EventLine:
     """The event line of an outcome."""
     return event_line(
         t_s=outcome.t_s,
@@ -200,7 +202,7 @@ def line_of(outcome: Outcome) -> EventLine:
     )
 
 
-def as_mapping(message: msgspec.Struct) -> Mapping[str, Any]:
+def to_mapping(message: msgspec.Struct) -> Mapping[str, Any]:
     """A message as plain keys and values, for the HTTP server."""
     return cast(Mapping[str, Any], msgspec.to_builtins(message))
 

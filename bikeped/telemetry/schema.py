@@ -87,7 +87,7 @@ class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
     max: float
 
 
-class Part(msgspec.Struct, frozen=True, kw_only=True):
+class ComponentStatus(msgspec.Struct, frozen=True, kw_only=True):
     """One part of the system: does it work, and one line about it."""
 
     ok: bool
@@ -126,8 +126,8 @@ class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
     fps: Annotated[float, Meta(ge=0)]
     latency_ms: Annotated[dict[str, StageLatency], Meta(description="by stage")]
     camera: CameraHealth
-    detector: Part
-    light: Part
+    detector: ComponentStatus
+    light: ComponentStatus
     faults: Annotated[list[str], Meta(description="what is wrong, one line each; empty: nothing")]
     counters: Counters
 

@@ -20,8 +20,8 @@ from aiohttp import hdrs, web
 from bikeped.config import WebConfig
 from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.latency import STAGES
-from bikeped.web.live_picture import Painter
-from bikeped.web.live_state import Watch
+from bikeped.web.live_picture import PictureRenderer
+from bikeped.web.live_state import LiveState
 from bikeped.web.server import Page, add_page
 
 #: At most so many messages a second to one page.
@@ -36,14 +36,14 @@ _BOUNDARY = "bikeped-picture-4c1d9f"
 _EDGE = f"\r\n--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n\r\n".encode()
 
 
-class Live:
+class LivePage:
     """The live page of one running service or replay."""
 
-    def __init__(self, watch: Watch, inside: Inside) -> None:
+    def __init__(self, state: LiveState, inside: Inside) -> None:
         self._config: WebConfig = inside.loaded.config.web
-        self._watch, self._inside = watch, inside
-        self.painter = Painter(
-            watch, inside.judge, self._config.stream_width, self._config.stream_fps
+        self._state, self._inside = state, inside
+        self.renderer = PictureRenderer(
+            state, inside.judge, self._config.stream_width, self._config.stream_fps
         )
         self._pages = self._streams = 0
         self._status: tuple[float, bytes] = (-1.0, b"")
@@ -51,8 +51,8 @@ class Live:
 
     def close(self) -> None:
         """Ends all streams."""
-        self._watch.close()
-        self.painter.close()
+        self._state.close()
+        self.renderer.close()
 
     async def events(self, request: web.Request) -> web.StreamResponse:
         """Server-sent events: `hello` once, `now` up to ten a second, `status` every second,
@@ -65,19 +65,19 @@ class Live:
             _keep_little(request)
             await _send(request, response, _event("hello", msgspec.json.encode(self._hello())))
             number, alerts, next_status_s, trend_s = -1, -1, 0.0, 0.0
-            watch = self._watch
-            while not watch.closed:
-                await watch.changed(number, STATUS_S)
+            state = self._state
+            while not state.closed:
+                await state.changed(number, STATUS_S)
                 began_s = time.monotonic()
-                number = watch.number
+                number = state.number
                 parts = [_event("now", self._encode_now())]
-                if watch.alerts_number != alerts:
-                    alerts = watch.alerts_number
-                    parts.append(_event("alerts", msgspec.json.encode(list(watch.alerts))))
+                if state.alerts_number != alerts:
+                    alerts = state.alerts_number
+                    parts.append(_event("alerts", msgspec.json.encode(list(state.alerts))))
                 if began_s >= next_status_s:
                     next_status_s = began_s + STATUS_S
                     parts.append(_event("status", self._encode_status(began_s)))
-                    new = [point for point in watch.trend if point.unix_s > trend_s]
+                    new = [point for point in state.trend if point.unix_s > trend_s]
                     if new:
                         trend_s = new[-1].unix_s
                         parts.append(_event("trend", msgspec.json.encode(new)))
@@ -92,7 +92,7 @@ class Live:
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """The picture with boxes, tracks and the pair, as Motion JPEG."""
-        with self._counted("_streams"), self.painter.looking(), _until_left():
+        with self._counted("_streams"), self.renderer.looking(), _until_left():
             response = web.StreamResponse(
                 headers={hdrs.CONTENT_TYPE: f"multipart/x-mixed-replace; boundary={_BOUNDARY}"}
             )
@@ -100,7 +100,7 @@ class Live:
             _keep_little(request)
             await _send(request, response, _EDGE)
             number = -1
-            while (picture := await self.painter.next(number)) is not None:
+            while (picture := await self.renderer.next(number)) is not None:
                 number, jpeg = picture
                 await _send(request, response, jpeg + _EDGE)
         return response
@@ -128,7 +128,7 @@ class Live:
             "stages": STAGES,
             "config_hash": loaded.hash,
             "calibration_hash": loaded.calibration_hash,
-            "source": shown_source(self._inside.source),
+            "source": display_source(self._inside.source),
             "detector": self._inside.detector,
             "light": config.feedback.light,
             "rule": config.decision.rule,
@@ -143,9 +143,9 @@ class Live:
     def _encode_now(self) -> bytes:
         """The moment as JSON, made once for all pages; without news anew all the same, for the
         ages in it grow."""
-        key = (self._watch.number, int(time.monotonic() * EVENTS_HZ))
+        key = (self._state.number, int(time.monotonic() * EVENTS_HZ))
         if self._now[0] != key:
-            self._now = (key, msgspec.json.encode(self._watch.now()))
+            self._now = (key, msgspec.json.encode(self._state.snapshot()))
         return self._now[1]
 
     def _encode_status(self, now_s: float) -> bytes:
@@ -157,7 +157,7 @@ class Live:
         return self._status[1]
 
 
-def shown_source(source: str) -> str:
+def display_source(source: str) -> str:
     """A camera's name for people: without a password in an address, or the way to a file."""
     if "://" in source:
         scheme, _, rest = source.partition("://")
@@ -165,7 +165,7 @@ def shown_source(source: str) -> str:
     return source if source.startswith("/dev/") else PurePath(source).name or source
 
 
-def add_live(app: web.Application, live: Live) -> None:
+def add_live(app: web.Application, live: LivePage) -> None:
     """Adds `/` and `/live/...`."""
     page = Page("/", "Live", "Live", "live.html", scripts=("live.js",), styles=("live.css",))
     add_page(app, page)

@@ -19,13 +19,13 @@ import numpy as np
 
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.errors import CaptureError
-from bikeped.overlay import Moment, draw_overlay, encode_jpeg, ground_projector
+from bikeped.overlay import OverlayData, draw_overlay, encode_jpeg, ground_projector
 from bikeped.pipeline.loop import Outcome
 from bikeped.pipeline.rate_limited_log import Seldom
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.worker_threads import Worker
 from bikeped.types import FloatArray, ImageArray, Signal
-from bikeped.web.live_state import Watch
+from bikeped.web.live_state import LiveState
 
 log = logging.getLogger(__name__)
 
@@ -33,11 +33,11 @@ _NICENESS = 10
 _QUALITY = 80
 
 
-class Painter:
-    """Pictures of `watch`'s frames as JPEG, at most `fps` a second and `width` wide."""
+class PictureRenderer:
+    """Pictures of `state`'s frames as JPEG, at most `fps` a second and `width` wide."""
 
-    def __init__(self, watch: Watch, judge: Judge, width: int, fps: float) -> None:
-        self._watch, self._judge = watch, judge
+    def __init__(self, state: LiveState, judge: Judge, width: int, fps: float) -> None:
+        self._state, self._judge = state, judge
         self._width, self._interval_s = width, 1.0 / fps
         self._lookers = 0
         self._painting: asyncio.Task[None] | None = None
@@ -64,14 +64,14 @@ class Painter:
 
     async def next(self, since: int) -> tuple[int, bytes] | None:
         """The newest picture after picture number `since`; None when there will be none."""
-        while not self._watch.closed:
+        while not self._state.closed:
             if self.jpeg is not None and self.number != since:
                 return self.number, self.jpeg
             await self._fresh.wait()
         return None
 
     def close(self) -> None:
-        """Lets everybody go who waits; after the watch was closed."""
+        """Lets everybody go who waits; after the state was closed."""
         self._tell()
 
     def _tell(self) -> None:
@@ -83,15 +83,15 @@ class Painter:
         worker.submit(_step_back)
         frames = -1
         try:
-            while not self._watch.closed:
-                await self._watch.next_frame(frames)
-                frames, outcome = self._watch.frames, self._watch.outcome
+            while not self._state.closed:
+                await self._state.next_frame(frames)
+                frames, outcome = self._state.frames, self._state.outcome
                 if outcome is None:
                     continue
                 began_s = time.monotonic()
                 try:
                     self.jpeg = await worker.submit(
-                        self._draw, decoder, outcome, self._watch.signal_now, self._trails()
+                        self._draw, decoder, outcome, self._state.signal_now, self._trails()
                     )
                 except Exception as error:  # noqa: BLE001 - a picture less, never more
                     self._seldom.failure("paint", error)
@@ -115,7 +115,7 @@ class Painter:
         history: Mapping[int, FloatArray],
     ) -> bytes:
         frame, judgement = outcome.picture.frame, outcome.judgement
-        moment = Moment(
+        overlay_data = OverlayData(
             detections=outcome.detections,
             tracks=judgement.tracks,
             decision=judgement.decision,
@@ -130,7 +130,7 @@ class Painter:
         return encode_jpeg(
             draw_overlay(
                 small,
-                moment,
+                overlay_data,
                 scale=small.shape[1] / frame.width,
                 ground_to_frame=ground_projector(self._judge.viewpoint.camera, framing),
                 banner=False,
@@ -154,6 +154,6 @@ class Painter:
 
 
 def _step_back() -> None:
-    """Gives this thread a lower priority than those that watch the crossing."""
+    """Gives this thread a lower priority than those of the pipeline."""
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)

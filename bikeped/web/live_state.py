@@ -47,7 +47,7 @@ class SeenPair(msgspec.Struct, frozen=True):
     d_max_m: float
 
 
-class Now(msgspec.Struct, frozen=True):
+class LiveSnapshot(msgspec.Struct, frozen=True):
     """What is known at this moment. Ages are seconds; None: nothing has come yet."""
 
     number: int
@@ -65,7 +65,7 @@ class Now(msgspec.Struct, frozen=True):
     tracks: tuple[SeenTrack, ...]
 
 
-class AlertSeen(msgspec.Struct):
+class AlertRecord(msgspec.Struct):
     """One ALERT from its first frame to its last, with the figures that fired it."""
 
     started_unix_s: float
@@ -85,7 +85,7 @@ class TrendPoint(msgspec.Struct, frozen=True):
     p95: tuple[float | None, ...]
 
 
-class Watch:
+class LiveState:
     """An output and signal listener of the loop that remembers; `changed` waits for news."""
 
     def __init__(
@@ -98,7 +98,7 @@ class Watch:
         self.signal_now: Signal | None = None
         self.number = 0  #: grows with every piece of news
         self.frames = 0  #: grows with every frame
-        self.alerts: deque[AlertSeen] = deque(maxlen=ALERTS)
+        self.alerts: deque[AlertRecord] = deque(maxlen=ALERTS)
         self.alerts_number = 0  #: grows whenever `alerts` changes
         self.trend: deque[TrendPoint] = deque(maxlen=TREND_S)
         self.closed = False
@@ -138,15 +138,15 @@ class Watch:
             return
 
     async def next_frame(self, since: int) -> None:
-        """Returns when there is a frame after frame number `since`, or the watch is closed."""
+        """Returns when there is a frame after frame number `since`, or closed."""
         while self.frames == since and not self.closed:
             await self._news.wait()
 
-    def now(self) -> Now:
+    def snapshot(self) -> LiveSnapshot:
         """Everything that a page shows of this moment."""
         signal, outcome, now_s = self.signal_now, self.outcome, self._clock()
         decision = self._decision
-        return Now(
+        return LiveSnapshot(
             number=self.number,
             signal="OFF" if signal is None else signal.name,
             colour="off" if signal is None else signal.colour.value,
@@ -179,7 +179,7 @@ class Watch:
         pair = _pair(decision.pair)
         if last is None or not going_on:
             self.alerts.append(
-                AlertSeen(
+                AlertRecord(
                     started_unix_s=self._wall(),
                     ended_unix_s=None,
                     sentence=decision.sentence,

@@ -8,13 +8,13 @@ from aiohttp import web
 
 from bikeped.config import LoadedConfig
 from bikeped.pipeline.loop import Outcome
-from bikeped.pipeline.telemetry import as_mapping
+from bikeped.pipeline.telemetry import to_mapping
 from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.http_server import add_monitoring
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align
-from bikeped.web.live import Live, add_live
-from bikeped.web.live_state import Watch
+from bikeped.web.live import LivePage, add_live
+from bikeped.web.live_state import LiveState
 from bikeped.web.security import open_access
 from bikeped.web.server import make_pages
 
@@ -27,23 +27,23 @@ class ServicePages:
 
     def __init__(self, loaded: LoadedConfig) -> None:
         self._access = open_access(loaded.config.web, loaded.base_dir, loaded.source)
-        self.watch = Watch()
+        self.state = LiveState()
 
     async def frame(self, outcome: Outcome) -> None:
-        await self.watch.frame(outcome)
+        await self.state.frame(outcome)
 
     def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
-        self.watch.signal(signal, sentence, decision)
+        self.state.signal(signal, sentence, decision)
 
     def application(self, inside: Inside) -> web.Application:
         app = make_pages(
             self._access,
-            partial(add_live, live=Live(self.watch, inside)),
+            partial(add_live, live=LivePage(self.state, inside)),
             partial(add_align, loaded=inside.loaded, frame=self.newest),
         )
-        add_monitoring(app, inside.metrics, lambda: as_mapping(inside.health()))
+        add_monitoring(app, inside.metrics, lambda: to_mapping(inside.health()))
         return app
 
     def newest(self) -> Frame | None:
         """The newest frame that was judged."""
-        return None if self.watch.outcome is None else self.watch.outcome.picture.frame
+        return None if self.state.outcome is None else self.state.outcome.picture.frame

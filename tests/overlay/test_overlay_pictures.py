@@ -7,9 +7,9 @@ import pytest
 from bikeped.errors import CaptureError
 from bikeped.geometry import Framing, GroundCamera, Lens
 from bikeped.overlay import (
-    Moment,
-    RadarFrame,
-    VideoSink,
+    OverlayData,
+    RadarProjection,
+    VideoWriter,
     compose,
     draw_overlay,
     draw_radar,
@@ -49,7 +49,7 @@ def moment(state=State.ALERT, **changes):
     )
     pair = PAIR if state >= State.WARNING else None
     decision = Decision(2.0, state, f"{state.name}: because.", pair)
-    whole = Moment(detections, tracks, decision, 60, 2.0, latency_s=0.05)
+    whole = OverlayData(detections, tracks, decision, 60, 2.0, latency_s=0.05)
     return replace(whole, **changes)
 
 
@@ -130,7 +130,7 @@ def test_projector_agrees_with_the_camera_and_hides_what_is_behind():
 
 
 def test_radar_puts_a_track_at_its_place():
-    frame = RadarFrame.fit(480, 640)
+    frame = RadarProjection.fit(480, 640)
     one = moment(State.SAFE)
     tracks = replace(one.tracks, velocity_mps=np.zeros((3, 2)))
     image = draw_radar(replace(one, tracks=tracks), (480, 640))
@@ -145,7 +145,7 @@ def test_radar_puts_a_track_at_its_place():
 
 
 def test_radar_marks_far_tracks_on_the_rim():
-    frame = RadarFrame.fit(480, 640)
+    frame = RadarProjection.fit(480, 640)
     one = moment(State.SAFE)
     far = replace(one.tracks, xy_m=np.array([[40.0, 0.0], [9.0, 6.0], [15.0, 0.0]]))
     image = draw_radar(replace(one, tracks=far), (480, 640))
@@ -166,9 +166,9 @@ def test_radar_shows_the_trail():
     trail = np.array([[6.0, -9.0], [8.0, -7.0], [10.0, -5.0]])
     image = draw_radar(replace(bare, history={7: trail, 99: trail + 5}), (480, 640))
     difference = changed(image, draw_radar(bare, (480, 640)))
-    u, v = RadarFrame.fit(480, 640).pixels((7.0, -8.0)).round().astype(int)
+    u, v = RadarProjection.fit(480, 640).pixels((7.0, -8.0)).round().astype(int)
     assert difference[v - 1 : v + 2, u - 1 : u + 2].any()
-    u, v = RadarFrame.fit(480, 640).pixels((12.0, -3.0)).round().astype(int)
+    u, v = RadarProjection.fit(480, 640).pixels((12.0, -3.0)).round().astype(int)
     assert not difference[v - 1 : v + 2, u - 1 : u + 2].any(), "a track that is gone left a trail"
 
 
@@ -181,7 +181,9 @@ def test_compose_has_the_size_asked_for_and_repeats(size):
 
 @pytest.mark.parametrize("tracks", [Tracks.empty(0.0)])
 def test_empty_moment_draws(tracks):
-    empty = Moment(Detections.empty(), tracks, Decision(0.0, State.IDLE, "IDLE: nobody."), 0, 0.0)
+    empty = OverlayData(
+        Detections.empty(), tracks, Decision(0.0, State.IDLE, "IDLE: nobody."), 0, 0.0
+    )
     compose(GREY, empty)
     lost_pair = replace(moment(), tracks=tracks)
     assert lost_pair.pair_rows() is None
@@ -198,7 +200,7 @@ def test_jpeg_is_the_picture():
 
 def test_sink_writes_a_video_and_only_at_close(tmp_path):
     path = tmp_path / "out.mp4"
-    with VideoSink(path, 30, (320, 180)) as sink:
+    with VideoWriter(path, 30, (320, 180)) as sink:
         for grey in range(0, 100, 10):
             sink.write(np.full((180, 320, 3), (200, grey, 0), np.uint8))
         assert not path.exists()
@@ -212,7 +214,7 @@ def test_sink_writes_a_video_and_only_at_close(tmp_path):
 
 def test_sink_discards_on_an_exception_and_refuses_other_sizes(tmp_path):
     def interrupted():
-        with VideoSink(tmp_path / "out.mp4", 30, (320, 180)) as sink:
+        with VideoWriter(tmp_path / "out.mp4", 30, (320, 180)) as sink:
             sink.write(np.zeros((10, 10, 3), np.uint8))
 
     with pytest.raises(ValueError, match="expected"):
@@ -223,11 +225,11 @@ def test_sink_discards_on_an_exception_and_refuses_other_sizes(tmp_path):
 @pytest.mark.parametrize("name", ["no/such/folder.mp4", "out.mov"])
 def test_sink_says_why_it_cannot_open(tmp_path, name):
     with pytest.raises(CaptureError, match=r"\.mp4|folder"):
-        VideoSink(tmp_path / name, 30, (320, 180))
+        VideoWriter(tmp_path / name, 30, (320, 180))
 
 
 def test_sink_without_pictures_is_an_error(tmp_path):
-    sink = VideoSink(tmp_path / "out.mp4", 30, (320, 180))
+    sink = VideoWriter(tmp_path / "out.mp4", 30, (320, 180))
     with pytest.raises(CaptureError, match="no picture"):
         sink.close()
     assert list(tmp_path.iterdir()) == []

@@ -11,10 +11,10 @@ from pipeline_fakes import Clock, Rig, seen, small
 from prometheus_client import generate_latest
 
 from bikeped.feedback import SignalLogic
-from bikeped.pipeline.health_report import health_line, tell_health
+from bikeped.pipeline.health_report import health_line, report_health
 from bikeped.pipeline.signal_dispatcher import Announcer
 from bikeped.pipeline.telemetry import Telemetry
-from bikeped.telemetry.builders import Part, encode
+from bikeped.telemetry.builders import ComponentStatus, encode
 from bikeped.telemetry.metrics import Metrics
 from bikeped.types import Kind
 
@@ -129,7 +129,7 @@ async def test_every_frame_is_a_line_of_the_audit_log():
 
 async def test_health_says_what_is_wrong_and_how_old_the_newest_frame_is(small_jpegs):
     async with TelemetryRig() as rig:
-        part = Part(ok=True, detail="simulated")
+        part = ComponentStatus(ok=True, detail="simulated")
         valid("health", encode(rig.telemetry.health(rig.loop, part)))  # before any frame
         await rig.well()
         await rig.frames(1, jpeg=b"junk")
@@ -155,7 +155,7 @@ async def test_health_says_what_is_wrong_and_how_old_the_newest_frame_is(small_j
 
 async def test_a_geometry_fault_makes_the_cameras_health_bad_and_no_other():
     async with TelemetryRig() as rig:
-        part = Part(ok=True, detail="simulated")
+        part = ComponentStatus(ok=True, detail="simulated")
         await rig.well()
         rig.clock.now_s += 0.03
         rig.feed.put(rig.clock.now_s, width=96, height=96)
@@ -195,9 +195,9 @@ async def test_a_failing_health_report_costs_a_message_and_no_more(caplog):
             calls.put_nowait(1)
             if calls.qsize() == 1:
                 raise ValueError("a bug")
-            return rig.telemetry.health(rig.loop, Part(ok=True, detail=""))
+            return rig.telemetry.health(rig.loop, ComponentStatus(ok=True, detail=""))
 
-        telling = asyncio.create_task(tell_health(rig.telemetry, rig.loop, health, 0.01))
+        telling = asyncio.create_task(report_health(rig.telemetry, rig.loop, health, 0.01))
         try:
             while not rig.publisher.of("health"):
                 assert not telling.done()

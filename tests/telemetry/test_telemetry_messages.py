@@ -76,10 +76,10 @@ def health_message(**changes) -> m.HealthMessage:
         "uptime_s": 12.34,
         "fps": 29.987654,
         "latency_ms": {"total": {"p50": 1.234, "p95": 2.0, "p99": 3.0, "max": 4.0, "mean": 1.5}},
-        "camera": m.Part(ok=False, detail="no frame for 2 s"),
+        "camera": m.ComponentStatus(ok=False, detail="no frame for 2 s"),
         "capture_age_ms": None,
-        "detector": m.Part(ok=True, detail="onnxruntime, CPU"),
-        "light": m.Part(ok=True, detail="gpio"),
+        "detector": m.ComponentStatus(ok=True, detail="onnxruntime, CPU"),
+        "light": m.ComponentStatus(ok=True, detail="gpio"),
         "faults": ["camera: no frame for 2 s"],
         "counters": COUNTERS,
     }

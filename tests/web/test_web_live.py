@@ -22,8 +22,8 @@ from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.mqtt import MqttStatus
-from bikeped.web.live import Live, add_live, shown_source
-from bikeped.web.live_state import ALERTS, TREND_S, Watch
+from bikeped.web.live import LivePage, add_live, display_source
+from bikeped.web.live_state import ALERTS, TREND_S, LiveState
 from bikeped.web.server import make_pages
 from bikeped.web.service_pages import ServicePages
 
@@ -31,12 +31,12 @@ PATIENCE_S = 20.0
 
 
 class Page:
-    """The live page's server with a watch that the test feeds."""
+    """The live page's server with a state that the test feeds."""
 
     def __init__(self, within: Inside) -> None:
         self.inside = within
-        self.watch = Watch()
-        self.live = Live(self.watch, within)
+        self.state = LiveState()
+        self.live = LivePage(self.state, within)
         self.scene = Scene(within.judge)
         app = make_pages(OPEN, partial(add_live, live=self.live))
         self.server = HttpServer(app, within.loaded.config.web)
@@ -48,8 +48,8 @@ class Page:
 
     async def show(self, signal: str = "SAFE", sentence: str = "a sentence", **more: Any) -> None:
         outcome = self.scene.next(signal, **more)
-        self.watch.signal(SIGNALS[signal], sentence, outcome.judgement.decision)
-        await self.watch.frame(outcome)
+        self.state.signal(SIGNALS[signal], sentence, outcome.judgement.decision)
+        await self.state.frame(outcome)
 
 
 @pytest.fixture
@@ -104,12 +104,12 @@ async def test_events_tell_the_state_the_reason_and_the_tracks(make_page):
         now = await events.until("now", lambda data: data["frame"] == 4)
         assert (now["signal"], now["blink_hz"]) == ("ALERT", 2.0)
         assert [track["kind"] for track in now["tracks"]] == ["pedestrian", "cyclist"]
-        tracks = page.watch.outcome.judgement.tracks
+        tracks = page.state.outcome.judgement.tracks
         assert [(t["x"], t["y"]) for t in now["tracks"]] == [
             tuple(xy) for xy in tracks.xy_m.round(3).tolist()
         ]
         assert 0 <= now["frame_age_s"] < PATIENCE_S
-        page.watch.signal(SIGNALS["FAULT"], "camera: no frame for 2.0 s", None)
+        page.state.signal(SIGNALS["FAULT"], "camera: no frame for 2.0 s", None)
         now = await events.until("now", lambda data: data["signal"] == "FAULT")
         assert now["faults"] == ["camera: no frame for 2.0 s"]
         status = await events.until("status")
@@ -128,7 +128,7 @@ async def test_events_tell_the_state_the_reason_and_the_tracks(make_page):
     ],
 )
 def test_no_password_and_no_folder_of_a_source_is_shown(source, shown):
-    assert shown_source(source) == shown
+    assert display_source(source) == shown
 
 
 async def test_the_broker_is_told_as_it_stands(make_page):
@@ -156,38 +156,38 @@ async def test_without_news_the_ages_grow(make_page):
 
 async def test_alerts_are_kept_with_their_numbers_and_bounded():
     page = Page(inside(small("decision.d_min_m=0.1", "decision.memory_frames=0")))
-    watch = page.watch
+    state = page.state
     for _ in range(20):
         await page.show()
-    assert len(watch.alerts) == 1
-    (alert,) = watch.alerts
+    assert len(state.alerts) == 1
+    (alert,) = state.alerts
     assert alert.pair is not None
     assert alert.nearest_m < alert.pair.distance_m  # the cyclist came nearer
     assert alert.sentence.startswith("ALERT: ")
     assert alert.frames > 10
     assert alert.ended_unix_s is None
-    number = watch.alerts_number
+    number = state.alerts_number
     for _ in range(3 * ALERTS):
         page.inside.judge.reset()
         page.scene = Scene(page.inside.judge)
         for _ in range(6):
             await page.show()
-    assert len(watch.alerts) == ALERTS
-    assert watch.alerts_number > number
-    assert all(alert.ended_unix_s is not None for alert in list(watch.alerts)[:-1])
+    assert len(state.alerts) == ALERTS
+    assert state.alerts_number > number
+    assert all(alert.ended_unix_s is not None for alert in list(state.alerts)[:-1])
 
 
 async def test_latencies_become_a_point_a_second_and_are_bounded():
     now_s = [1000.0]
-    watch = Watch(wall_clock=lambda: now_s[0])
+    state = LiveState(wall_clock=lambda: now_s[0])
     scene = Scene(inside().judge)
     outcomes = [scene.next() for _ in range(6)]
     for second in range(TREND_S + 30):
         now_s[0] = 1000.0 + second
         for outcome in outcomes:
-            await watch.frame(outcome)
-    assert len(watch.trend) == TREND_S
-    point = watch.trend[-1]
+            await state.frame(outcome)
+    assert len(state.trend) == TREND_S
+    point = state.trend[-1]
     assert (point.unix_s, point.fps) == (1000.0 + TREND_S + 28, 6)
     inference = [outcome.latency_ms["inference"] for outcome in outcomes]
     row = STAGES.index("inference")
@@ -241,19 +241,19 @@ async def test_nothing_is_drawn_while_nobody_looks(make_page):
     page = await make_page("web.stream_fps=30")
     for _ in range(5):
         await page.show()
-    assert page.live.painter.drawn == 0
+    assert page.live.renderer.drawn == 0
     async with aiohttp.ClientSession() as session:
         async with session.get(f"{page.url}/live/stream") as answer:
             await Pictures(answer).next()
         # The visitor leaves; as soon as the server learns of it, the drawing ends.
-        while page.live.painter._painting is not None:
+        while page.live.renderer._painting is not None:
             await page.show()
             await asyncio.sleep(0.01)
-        drawn = page.live.painter.drawn
+        drawn = page.live.renderer.drawn
         for _ in range(20):
             await page.show()
             await asyncio.sleep(0.01)
-        assert page.live.painter.drawn == drawn
+        assert page.live.renderer.drawn == drawn
 
 
 async def test_many_lookers_share_one_drawing(make_page):
@@ -263,7 +263,7 @@ async def test_many_lookers_share_one_drawing(make_page):
         answers = [await session.get(f"{page.url}/live/stream") for _ in range(5)]
         for answer in answers:
             await Pictures(answer).next()
-        assert page.live.painter.drawn == 1
+        assert page.live.renderer.drawn == 1
         for answer in answers:
             answer.close()
 
@@ -272,7 +272,7 @@ async def test_a_damaged_frame_is_a_picture_less_and_no_more(make_page, caplog):
     page = await make_page("web.stream_fps=30")
     outcome = page.scene.next()
     object.__setattr__(outcome.picture.frame, "jpeg", b"\xff\xd8 no picture")
-    await page.watch.frame(outcome)
+    await page.state.frame(outcome)
     async with aiohttp.ClientSession() as session, session.get(f"{page.url}/live/stream") as answer:
         waiting = asyncio.create_task(Pictures(answer).next())
         while not waiting.done():
@@ -327,8 +327,8 @@ async def test_a_client_that_reads_nothing_holds_nobody_up(make_page, monkeypatc
         pictures = Pictures(answer)
         waiting = asyncio.create_task(pictures.next())
         # Until both lazy streams are let go, frames are taken as ever, and the eager one sees them.
-        while page.live._streams > 1 or page.watch.frames < 60:
-            at_once(page.show(grey=int(page.watch.frames) % 200))
+        while page.live._streams > 1 or page.state.frames < 60:
+            at_once(page.show(grey=int(page.state.frames) % 200))
             if waiting.done():
                 await waiting
                 waiting = asyncio.create_task(pictures.next())
@@ -367,7 +367,7 @@ class Probe(ServicePages):
 
     async def frame(self, outcome: Any) -> None:
         await super().frame(outcome)
-        if self.watch.frames == 3:
+        if self.state.frames == 3:
             self.found = await self._visit("", self.app)
 
 

@@ -23,8 +23,8 @@ from bikeped.lab.rendering.clip import sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
 from bikeped.pipeline.replay import ReplayFiles, ReplayResult, replay
 from bikeped.telemetry.builders import parse_event
-from bikeped.web.live import Live, add_live
-from bikeped.web.live_state import Watch
+from bikeped.web.live import LivePage, add_live
+from bikeped.web.live_state import LiveState
 from bikeped.web.server import make_pages
 from bikeped.web.service_pages import ServicePages
 
@@ -172,7 +172,7 @@ class Told:
 
     def __init__(self, start: Callable[..., Any]) -> None:
         self.within = inside(small("web.stream_fps=30", "decision.d_min_m=0.1"))
-        self.watch = Watch()
+        self.state = LiveState()
         self.scene = Scene(self.within.judge)
         self._telling = ("SAFE", "Somebody is here.")
         self.ticks = True
@@ -180,7 +180,7 @@ class Told:
         self.url = self.served.url
 
     def _make(self) -> web.Application:
-        self.live = Live(self.watch, self.within)
+        self.live = LivePage(self.state, self.within)
         app = make_pages(OPEN, partial(add_live, live=self.live))
 
         async def begin(_app: web.Application) -> None:
@@ -198,9 +198,9 @@ class Told:
             name, sentence = self._telling
             if self.ticks:
                 decision = None
-                if self.watch.outcome is not None:
-                    decision = self.watch.outcome.judgement.decision
-                self.watch.signal(SIGNALS[name], sentence, decision)
+                if self.state.outcome is not None:
+                    decision = self.state.outcome.judgement.decision
+                self.state.signal(SIGNALS[name], sentence, decision)
             await asyncio.sleep(0.05)
 
     def tell(self, name: str, sentence: str = "Because.") -> None:
@@ -209,7 +209,7 @@ class Told:
     def show_frame(self, count: int = 1) -> None:
         async def show() -> None:
             for _ in range(count):
-                await self.watch.frame(self.scene.next())
+                await self.state.frame(self.scene.next())
 
         asyncio.run_coroutine_threadsafe(show(), self.served.loop).result(PATIENCE_S)
 
@@ -338,7 +338,7 @@ def test_who_does_not_look_costs_nothing(told, open_page, until):
         "document.dispatchEvent(new Event('visibilitychange'))"
     )
     gone()
-    assert told.live.painter._painting is None
+    assert told.live.renderer._painting is None
     page.evaluate(
         "Object.defineProperty(document, 'hidden', {get: () => false, configurable: true});"
         "document.dispatchEvent(new Event('visibilitychange'))"
@@ -364,7 +364,7 @@ def test_the_radar_draws_what_the_table_says(told, open_page, until):
     told.show_frame(3)
     page = open_page(told.url)
     expect(page.locator("#tracks tr")).to_have_count(2)
-    tracks = told.watch.now().tracks
+    tracks = told.state.snapshot().tracks
     # The picture of a state is drawn in the browser's next frame, after its table.
     page.wait_for_function(
         """([x, y, colour]) => {
