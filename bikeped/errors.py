@@ -1,11 +1,27 @@
 """Errors that a user can act on.
 
-Every message names the file, the key and the mend in one line; the command line prints it on
+Every message names the file, the key and the remedy in one line; the command line prints it on
 standard error and ends with status 2 (`BikepedError.exit_status`). Anything that is not a
 `BikepedError` is a bug in bikeped.
 """
 
 from __future__ import annotations
+
+from importlib.util import find_spec
+
+#: Packages that a base installation lacks, and the extra of bikeped that installs each.
+EXTRAS = {
+    "gpiod": "gpio",
+    "libreyolo": "train-yolo",
+    "matplotlib": "sim",
+    "onnx": "train",
+    "pycocotools": "evaluate",
+    "scipy": "sim",
+    "threadpoolctl": "calibrate",
+    "torch": "train",
+    "torchvision": "train-yolo",
+    "usb": "usb",
+}
 
 
 class BikepedError(Exception):
@@ -48,3 +64,18 @@ class ScenarioError(BikepedError):
 
 class DataSetError(BikepedError):
     """Pictures with boxes, for training or evaluation, are missing or malformed."""
+
+
+class MissingPackageError(BikepedError):
+    """A package of an extra is not installed. `extra`: the one to name, where several bring it."""
+
+    def __init__(self, package: str, extra: str | None = None) -> None:
+        extra = extra or EXTRAS[package]
+        super().__init__(f"{package} is not installed; pip install 'bikeped[{extra}]'")
+
+
+def require(*packages: str, extra: str | None = None) -> None:
+    """Raises MissingPackageError where one of EXTRAS is absent: before long work that needs it."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise MissingPackageError(package, extra)

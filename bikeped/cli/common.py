@@ -11,13 +11,14 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bikeped.files import write_whole
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -71,6 +72,8 @@ def write_json(data: Any, target: str) -> None:
 
 def console(json_path: str | None = None) -> Console:
     """Where tables for people go: standard output, unless JSON goes there."""
+    from rich.console import Console
+
     screen = Console(stderr=json_path == "-", highlight=False, soft_wrap=True)
     if not screen.is_terminal:
         screen.width = 250  # a file or a pipe is as wide as the table needs
@@ -80,10 +83,18 @@ def console(json_path: str | None = None) -> Console:
 @contextlib.contextmanager
 def progress_bar(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """A progress bar on standard error when that is a terminal; calls take the count so far."""
-    screen = Console(stderr=True)
+    screen = console("-")
     if not screen.is_terminal:
         yield lambda done: None
         return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeRemainingColumn(), console=screen, transient=True) as bar:
         task = bar.add_task(what, total=total)

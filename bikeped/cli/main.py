@@ -3,44 +3,36 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module
+from typing import Any
 
 import click
 
 from bikeped import __version__
 from bikeped.cli.common import set_up_logging
-from bikeped.errors import BikepedError
+from bikeped.cli.lazy_group import LazyGroup
+from bikeped.errors import EXTRAS, BikepedError, MissingPackageError
 
-#: Command: module that holds it as `command`. Imported only when asked for: a help page must not
-#: wait for a video library.
+#: Every command: its module, and the text for the help page. The lab's are found by name, so that
+#: the device imports nothing of the lab.
 COMMANDS = {
-    "run": "bikeped.cli.run",
-    "replay": "bikeped.cli.replay",
-    "demo": "bikeped.lab.cli.demo",
-    "config": "bikeped.cli.config",
-    "doctor": "bikeped.cli.doctor",
-    "align": "bikeped.cli.align",
-    "calibrate": "bikeped.lab.cli.calibrate",
-    "conformance": "bikeped.lab.cli.conformance",
-    "testbench": "bikeped.lab.cli.testbench",
-    "scene": "bikeped.lab.cli.scene",
-    "model": "bikeped.lab.cli.model",
+    "run": ("bikeped.cli.run", "Run the service: camera, tracking, decision, light and sound."),
+    "replay": ("bikeped.cli.replay", "Run a recorded video through the service's loop."),
+    "demo": ("bikeped.lab.cli.demo", "Draw a crossing and run it through the loop."),
+    "config": ("bikeped.cli.config", "Check, show or describe the configuration."),
+    "doctor": ("bikeped.cli.doctor", "Check camera, model, light, speaker, broker, clock, disk."),
+    "align": ("bikeped.cli.align", "Fit the camera's height and tilt to marks on the street."),
+    "calibrate": ("bikeped.lab.cli.calibrate", "Calibrate a lens from checkerboard pictures."),
+    "conformance": (
+        "bikeped.lab.cli.conformance",
+        "Simulate scripted hazards: experiments, gates, promotion.",
+    ),
+    "testbench": ("bikeped.lab.cli.testbench", "Explore scenarios and settings in the browser."),
+    "scene": ("bikeped.lab.cli.scene", "Render a scenario as labelled fisheye video."),
+    "model": ("bikeped.lab.cli.model", "Augment data, train, export and evaluate detectors."),
 }
 
 
-class _Lazy(click.Group):
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        module = COMMANDS.get(cmd_name)
-        if module is None:
-            return None
-        found: click.Command = import_module(module).command
-        return found
-
-
-@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=LazyGroup, lazy=COMMANDS, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="bikeped")
 @click.option(
     "--log-level",
@@ -55,9 +47,9 @@ def cli(log_level: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the command line: 0 did its job, 1 a check does not hold, 2 bad input."""
+    """Runs the command line; returns 0 (success), 1 (a check failed), 2 (bad input), 130 (^C)."""
     try:
-        result = cli.main(args=arguments, prog_name="bikeped", standalone_mode=False)
+        result = _invoke(arguments)
     except click.exceptions.Abort:
         click.echo("bikeped: interrupted", err=True)
         return 130
@@ -76,6 +68,17 @@ def main(arguments: list[str] | None = None) -> int:
         click.echo(f"bikeped: {' '.join(str(error).split())}", err=True)
         return error.exit_status
     return int(result or 0)
+
+
+def _invoke(arguments: list[str] | None) -> Any:
+    """Runs the command; MissingPackageError when it needs a package of an extra."""
+    try:
+        return cli.main(args=arguments, prog_name="bikeped", standalone_mode=False)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        raise MissingPackageError(package) from error
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from bikeped.errors import BikepedError
+from bikeped.errors import require
 from bikeped.files import write_whole
 from bikeped.types import FloatArray
 
@@ -69,16 +69,6 @@ DPI = 160
 _TITLE_PT, _CAPTION_PT, _MARGIN_IN = 11.5, 8.5, 0.12
 
 
-def require_matplotlib() -> None:
-    """BikepedError with the mend when the drawing library is not installed."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise BikepedError(
-            'matplotlib: not installed, and figures need it; pip install "bikeped[sim]"'
-        ) from error
-
-
 class Sheet:
     """One figure: title on top, panels, caption below. Use as a context manager around drawing.
 
@@ -97,7 +87,7 @@ class Sheet:
         legend_rows: int = 0,
         **subplots: Any,
     ) -> None:
-        require_matplotlib()
+        require("matplotlib")
         import matplotlib as mpl
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

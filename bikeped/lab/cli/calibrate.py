@@ -9,7 +9,7 @@ import click
 
 from bikeped.cli.common import FiniteRange, config_options, console, json_option
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.errors import BikepedError
+from bikeped.errors import require
 from bikeped.lab.cli.calibrate_options import PATTERN, Asked
 
 _MODELS = ("equidistant", "equisolid", "stereographic", "orthographic", "linear", "equalarea")
@@ -111,21 +111,13 @@ def command(
     # libraries read this once, when they are loaded.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    try:
-        from bikeped.lab.cli.calibrate_capture import live_pictures, write_board
-        from bikeped.lab.cli.calibrate_run import run
-        from bikeped.lab.cli.calibrate_tables import print_result
-    except ModuleNotFoundError as error:
-        if str(error.name).startswith("bikeped"):
-            raise
-        raise BikepedError(
-            f"{error.name}: not installed, and calibration needs it; pip install "
-            '"bikeped[calibrate]"'
-        ) from error
-    if report_path is not None:
-        from bikeped.lab.plotting import require_matplotlib
+    require("scipy", extra="calibrate")
+    from bikeped.lab.cli.calibrate_capture import live_pictures, write_board
+    from bikeped.lab.cli.calibrate_run import run
+    from bikeped.lab.cli.calibrate_tables import print_result
 
-        require_matplotlib()
+    if report_path is not None:
+        require("matplotlib")
     target = out or _DEFAULT_OUT
     if board_path is None:
         lens = [(f"{target}, the lens,", target)]

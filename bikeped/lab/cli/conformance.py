@@ -15,7 +15,7 @@ from bikeped.cli.common import (
 from bikeped.cli.guard import guarded
 from bikeped.config.candidate import load_decision
 from bikeped.cores import cores
-from bikeped.errors import BikepedError
+from bikeped.errors import BikepedError, require
 from bikeped.files import write_whole
 from bikeped.lab.cli.conformance_governance import add_commands
 from bikeped.lab.cli.conformance_pixels import command as pixels
@@ -24,7 +24,6 @@ from bikeped.lab.cli.conformance_shared import (
     burst_option,
     curve_option,
     emit,
-    optimizer,
     print_table,
     processes_option,
     stamp,
@@ -169,6 +168,7 @@ def montecarlo(
 
     The configuration's own decision is `configured` when it is none of the named ones.
     """
+    require("scipy")
     from bikeped.lab.experiments import montecarlo as mc
     from bikeped.lab.simulation.suite import CONFIGURATIONS
 
@@ -220,6 +220,7 @@ def latency(
     if not loss:
         result = late.sweep(suite, decision)
     else:
+        require("scipy")
         workers = processes or cores()
         jobs = mc.plan_jobs(1, trials)
         with progress_bar("trials", jobs) as progress:
@@ -270,7 +271,8 @@ def optimize(
     out: Path | None,
 ) -> None:
     """Search the decision's five parameters by differential evolution."""
-    search = optimizer()
+    from bikeped.lab.experiments import optimizer as search
+
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     chosen = search.SEED if seed is None else seed
     with progress_bar("evaluations", search.evaluations(maxiter, popsize)) as progress:
@@ -357,16 +359,14 @@ def reproduce(
     no_figures: bool,
 ) -> None:
     """All experiments with every table and figure; resumes where it was interrupted."""
-    optimizer()  # says at once when SciPy is not there
+    require("scipy")
     from bikeped.lab.experiments import reproduce as whole
     from bikeped.lab.experiments.deterministic import shown
     from bikeped.lab.experiments.montecarlo import load_recall_curve
     from bikeped.lab.result_tables import Table
 
     if not no_figures:
-        from bikeped.lab.plotting import require_matplotlib
-
-        require_matplotlib()
+        require("matplotlib")
     curve = None if curve_path is None else load_recall_curve(curve_path)
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     settings = whole.Settings(trials=trials, seed=seed or 0, burst=burst, curve=curve)

@@ -20,7 +20,7 @@ from bikeped.cli.common import (
 from bikeped.cli.guard import guarded
 from bikeped.config import load_config
 from bikeped.config.candidate import load_decision
-from bikeped.errors import BikepedError, ConfigError
+from bikeped.errors import BikepedError, ConfigError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.cli.conformance_shared import load_suite, scenarios_option
 from bikeped.lab.cli.governance_tables import count, print_contest, print_gates, print_register
@@ -263,9 +263,8 @@ def plot(
     """Draw each scenario: a strip over time and a plan from above."""
     from bikeped.lab.experiments.scenario_plan import draw_plan
     from bikeped.lab.experiments.strip_chart import draw_strip
-    from bikeped.lab.plotting import require_matplotlib
 
-    require_matplotlib()
+    require("matplotlib")
     loaded = load_config(config_path, overrides)
     suite = load_suite(loaded, scenarios_dir)
     if name is not None and name not in suite.names:

@@ -9,7 +9,7 @@ import click
 from bikeped.cli.common import console, progress_bar, width_height
 from bikeped.cli.guard import guarded
 from bikeped.cores import cores
-from bikeped.errors import BikepedError
+from bikeped.errors import BikepedError, require
 from bikeped.files import make_folder
 from bikeped.lab.cli.conformance_shared import begin, emit, processes_option, suite_options
 
@@ -72,9 +72,7 @@ def command(
 
     width, height = _size(size)
     if figures is not None:
-        from bikeped.lab.plotting import require_matplotlib
-
-        require_matplotlib()
+        require("matplotlib")
         make_folder(figures, "--figures")
     # One thread each: the processes share the cores. A --set that is given comes later and wins.
     overrides = ("detection.threads=1", *overrides)

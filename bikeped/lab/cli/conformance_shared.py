@@ -13,7 +13,6 @@ from rich.table import Table as RichTable
 
 from bikeped.cli.common import FiniteRange, config_options, console, json_option, write_json
 from bikeped.config import LoadedConfig, load_config
-from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
     from bikeped.lab.result_tables import Cell, Result, Table
@@ -152,14 +151,3 @@ def stamp(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
     from bikeped.lab.experiments.deterministic import provenance
 
     return provenance(suite, loaded, seed)
-
-
-def optimizer() -> Any:
-    """The optimiser's module; BikepedError where the extra that it needs is not installed."""
-    try:
-        from bikeped.lab.experiments import optimizer
-    except ImportError as error:
-        raise BikepedError(
-            f"{error.name}: not installed; install bikeped[sim] for the optimiser"
-        ) from error
-    return optimizer

@@ -1,32 +1,28 @@
-"""`bikeped model`: the detector's own tooling."""
+"""`bikeped model`: data, training, export and evaluation of detectors."""
 
 from __future__ import annotations
 
-from importlib import import_module
-
 import click
 
-#: Command: module that holds it as `command`, imported only when asked for.
+from bikeped.cli.lazy_group import LazyGroup
+
 COMMANDS = {
-    "augment": "bikeped.lab.cli.model_augment",
-    "train": "bikeped.lab.cli.model_train",
-    "export": "bikeped.lab.cli.model_export",
-    "evaluate": "bikeped.lab.cli.model_evaluate",
+    "augment": (
+        "bikeped.lab.cli.model_augment",
+        "Warp ordinary pictures with boxes into the fisheye view.",
+    ),
+    "train": ("bikeped.lab.cli.model_train", "Train a detector and export it to ONNX."),
+    "export": (
+        "bikeped.lab.cli.model_export",
+        "Export weights to ONNX, or build a TensorRT engine.",
+    ),
+    "evaluate": (
+        "bikeped.lab.cli.model_evaluate",
+        "Measure precision and recall of detectors, and compare them.",
+    ),
 }
 
 
-class _Lazy(click.Group):
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        module = COMMANDS.get(cmd_name)
-        if module is None:
-            return None
-        found: click.Command = import_module(module).command
-        return found
-
-
-@click.group("model", cls=_Lazy)
+@click.group("model", cls=LazyGroup, lazy=COMMANDS)
 def command() -> None:
     """Augment data, train, export and evaluate detectors."""

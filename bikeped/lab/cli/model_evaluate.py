@@ -17,7 +17,7 @@ from bikeped.cli.common import (
 )
 from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config import load_config
-from bikeped.errors import BikepedError
+from bikeped.errors import BikepedError, require
 from bikeped.lab.cli.conformance_shared import print_table
 
 if TYPE_CHECKING:
@@ -101,9 +101,7 @@ def command(
     from bikeped.lab.training.evaluate import EvaluationSettings, evaluate, load_models, write_curve
 
     if figure is not None:
-        from bikeped.lab.plotting import require_matplotlib
-
-        require_matplotlib()
+        require("matplotlib")
         if figure.suffix != ".png":
             raise BikepedError(f"--figure {figure}: is no .png; name one, a PDF comes beside it")
     source = read_coco(data, images_dir)

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from bikeped.cli.common import console, json_option, width_height, write_json
 from bikeped.cli.guard import guarded
-from bikeped.errors import DetectorError
+from bikeped.errors import DetectorError, require
 
 
 @click.command("export")
@@ -82,9 +82,7 @@ def command(
             )
         model = weights
     else:
-        from bikeped.lab.training.optional_deps import need
-
-        need("torch", "model export")
+        require("torch")
         from bikeped.lab.training.export import export_any
 
         model = weights.with_suffix(".onnx") if out is None else out

@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from bikeped.cli.common import console, json_option, progress_bar, write_json
 from bikeped.cli.guard import check_outputs, guarded
+from bikeped.errors import require
 from bikeped.files import make_folder
 
 
@@ -99,9 +100,8 @@ def command(
 ) -> int:
     """Train a detector on DATA (COCO's format: an annotation file, or its folder) and export it."""
     from bikeped.lab.training.coco import read_coco
-    from bikeped.lab.training.optional_deps import need
 
-    need("torch", "model train")
+    require("torch")
     source = read_coco(data, images_dir)
     make_folder(out)
     names = [out / name for name in ("weights.pt", "model.onnx", "training.json")]

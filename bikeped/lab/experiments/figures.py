@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.errors import BikepedError
+from bikeped.errors import BikepedError, require
 from bikeped.lab.experiments import figure_areas, figure_lines
-from bikeped.lab.plotting import require_matplotlib
 from bikeped.lab.simulation.suite import Suite
 
 Draw = Callable[[Mapping[str, Any], str, str, Path], list[Path]]
@@ -170,7 +169,7 @@ def draw_all(data: Mapping[str, Mapping[str, Any]], suite: Suite, folder: Path) 
     The same data give the same bytes. BikepedError when matplotlib is not installed or a file
     cannot be written.
     """
-    require_matplotlib()
+    require("matplotlib")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

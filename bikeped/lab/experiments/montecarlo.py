@@ -256,10 +256,8 @@ def _most(figure: str) -> float:
 
 def _student(freedom: int) -> float:
     """97.5 % quantile of Student's t."""
-    try:
-        from scipy.special import stdtrit
-    except ImportError as error:  # pragma: no cover - the sim extra is not there
-        raise BikepedError("scipy: not installed; install bikeped[sim]") from error
+    from scipy.special import stdtrit
+
     return float(stdtrit(freedom, 0.975))
 
 

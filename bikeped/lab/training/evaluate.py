@@ -35,7 +35,7 @@ from bikeped.detection import load_detector
 from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.nms import suppress
 from bikeped.detection.output_layouts import Candidates
-from bikeped.errors import DataSetError
+from bikeped.errors import DataSetError, require
 from bikeped.files import write_whole
 from bikeped.lab.training.coco import CocoData, read_picture
 from bikeped.lab.training.ground_truth import (
@@ -53,7 +53,6 @@ from bikeped.lab.training.measures import (
     measure,
     recall_by_distance,
     recall_curve,
-    require_pycocotools,
 )
 from bikeped.types import Detections, Kind
 
@@ -172,7 +171,7 @@ def evaluate(
     Raises DataSetError for data without road users (by the names in `detection`) and for pictures
     that cannot be read.
     """
-    require_pycocotools()
+    require("pycocotools")
     settings = settings or EvaluationSettings()
     kind_of = kinds_by_name(data.categories, detection)
     if not kind_of or not any(

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.errors import BikepedError
+from bikeped.errors import require
 from bikeped.lab.simulation.perception import SIZE_BOUNDS_PX2
 from bikeped.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -204,18 +204,8 @@ def recall_by_distance(truth: Truth, hits: BoolArray, category: int) -> list[dic
     return rows
 
 
-def require_pycocotools() -> None:
-    """BikepedError with the mend when the measuring library is not installed."""
-    try:
-        import pycocotools.cocoeval  # noqa: F401
-    except ImportError as error:
-        raise BikepedError(
-            'pycocotools: not installed, and evaluation needs it; pip install "bikeped[evaluate]"'
-        ) from error
-
-
 def _evaluation(truth: Truth, found: Found, classes: int, images: int) -> Any:
-    require_pycocotools()
+    require("pycocotools")
     from pycocotools.cocoeval import COCOeval
 
     gt_area, dt_area = truth.area_px2, _area(found.box_px)

@@ -19,11 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.errors import DataSetError, DetectorError
+from bikeped.errors import DataSetError, DetectorError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.training.coco import CocoData, CocoImage, write_annotations
 from bikeped.lab.training.onnx_file import compare, with_metadata
-from bikeped.lab.training.optional_deps import need
 
 _VALIDATION_SHARE = 20  #: one picture in so many, where no validation set is named
 _OPSET = 17
@@ -207,7 +206,7 @@ def _quoted(value: object) -> str:
 
 def _load(weights: Path | None, size: str | None, device: str) -> Any:
     """The library's model: from `weights`, or a fresh one of `size`."""
-    need("libreyolo", "model train and export of a YOLO")
+    require("libreyolo")
     library = importlib.import_module("libreyolo")
     if weights is not None and not weights.is_file():
         # The library would look for it on the network.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 
 import pytest
 from coco_sets import annotation, write_set
 
 from bikeped.cli.main import main
-from bikeped.lab.training import optional_deps as needs
 
 with_torch = pytest.mark.skipif(
     importlib.util.find_spec("torch") is None,
@@ -34,7 +34,7 @@ def test_help_names_the_four(capsys):
 
 
 def test_without_torch_it_says_what_to_install(data, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(needs, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "torch", None)
     out = tmp_path / "out"
     assert main(["model", "train", str(data), "--out", str(out)]) == 2
     assert "pip install 'bikeped[train]'" in said(capsys)

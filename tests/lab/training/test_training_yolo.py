@@ -24,7 +24,6 @@ from bikeped.lab.training.coco import read_coco
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
-from bikeped.lab.training import optional_deps as needs  # noqa: E402
 from bikeped.lab.training import yolo  # noqa: E402
 from bikeped.lab.training.yolo import YoloOrder, export_yolo, train_yolo, write_data  # noqa: E402
 
@@ -83,7 +82,7 @@ def library(monkeypatch):
     module.LibreYOLO9 = LibreYOLO9
     module.LibreYOLO = lambda path, device: LibreYOLO9(path, None, device)
     monkeypatch.setitem(sys.modules, "libreyolo", module)
-    monkeypatch.setattr(needs, "find_spec", lambda name: object())
+    monkeypatch.setattr("bikeped.errors.find_spec", lambda name: object())
     monkeypatch.setattr(yolo, "_version", lambda name: "1.6.0")
     LibreYOLO9.made = []
     return module
