@@ -5,7 +5,7 @@ Browser tests are plain functions (the synchronous API) in modules of their own,
 module holds no `async def` test.
 
     def test_it(serve, open_page):
-        url = serve(lambda: make_pages(access, add_mine))
+        url = serve(lambda: make_application(access, add_mine))
         page = open_page(url + "/mine")
 
 `open_page` fails the test at its end on any console error, page error or failed request that the

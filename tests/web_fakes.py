@@ -17,15 +17,15 @@ from bikeped.pipeline.web_context import Inside
 from bikeped.telemetry.builders import ComponentStatus, Counters, HealthMessage, health_message
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.types import Colour, Detections, Frame, Kind, Signal
-from bikeped.web.security import Access
+from bikeped.web.security import AccessPolicy
 
 #: Sizes to look at: a phone held upright, a projector.
 PHONE = {"width": 390, "height": 844}
 DESKTOP = {"width": 1440, "height": 900}
 
 TOKEN = "a-long-enough-token"
-OPEN = Access(frozenset({"localhost", "127.0.0.1", "::1"}))
-LOCKED = Access(frozenset({"localhost", "127.0.0.1", "::1"}), token=TOKEN)
+OPEN = AccessPolicy(frozenset({"localhost", "127.0.0.1", "::1"}))
+LOCKED = AccessPolicy(frozenset({"localhost", "127.0.0.1", "::1"}), token=TOKEN)
 
 CONFIG = """
 camera: {width: 960, height: 640, projection: perspective, pad_size: null, crop_size: null,

@@ -1,15 +1,15 @@
-"""The pages: live view, alignment, test bench; plain HTML, CSS and modules, no build step.
+"""The web pages: live view and alignment; plain HTML, CSS and JavaScript modules, no build step.
 
-How a page is made. Each page is a module with one function that adds it to an application:
+Each page is a module with one function that adds it to an application:
 
     add_live(app, live)                      bikeped/web/live.py
     add_align(app, ...)                      bikeped/web/align.py
     add_testbench(app, ...)                  bikeped/lab/testbench/pages.py
 
-It calls `server.add_page(app, Page("/align", "Align", ...))`, which serves `static/<body>.html`
-inside the common frame with its entry in the navigation, and adds its own routes below the page's
-path (`/align/...`). `server.make_pages(access, *adders)` makes the application: each adder is
-called with it, and every request goes through `security`. What is in `static/` is served as
+It calls `server.add_page(app, Page("/align", "Align", ...))`, which serves `templates/<name>.html`
+inside `templates/frame.html` with its entry in the navigation, and adds its own routes below the
+page's path (`/align/...`). `server.make_application(access, *page_adders)` calls each of these
+functions; every request goes through `security`. Files of `static/` are served as
 `/static/<name>`; scripts are modules that import `/static/ui.js`.
 
 The content security policy allows nothing inline: no `style="..."`, no `onclick`, no `innerHTML`

@@ -55,7 +55,7 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 @dataclass(frozen=True)
-class Access:
+class AccessPolicy:
     """Who is let in.
 
     `names`: host names that are answered to; `any_address`: so is every plain address, which no
@@ -99,7 +99,9 @@ class Access:
         return hmac.new(key, f"bikeped session {text}".encode(), hashlib.sha256).hexdigest()
 
 
-def open_access(config: WebConfig, base_dir: Path = Path(), source: str = "web") -> Access:
+def load_access_policy(
+    config: WebConfig, base_dir: Path = Path(), source: str = "web"
+) -> AccessPolicy:
     """Who is let in by this configuration; `source` names it in errors.
 
     Raises ConfigError when others could reach the pages without a token, or when the token's file
@@ -120,7 +122,7 @@ def open_access(config: WebConfig, base_dir: Path = Path(), source: str = "web")
     if not local:
         own = socket.gethostname()
         names |= {own, f"{own.partition('.')[0]}.local"}
-    return Access(frozenset(map(str.lower, names)), any_address=not local, token=token)
+    return AccessPolicy(frozenset(map(str.lower, names)), any_address=not local, token=token)
 
 
 def _read_token(path: Path) -> str:
@@ -144,7 +146,7 @@ def _read_token(path: Path) -> str:
     return token
 
 
-class Failures:
+class FailedLogins:
     """Wrong tokens of the last minute, by address and in all; bounded."""
 
     def __init__(
@@ -180,7 +182,9 @@ class Failures:
         return [t for t in times if t > since_s]
 
 
-def guard(access: Access, login: Callable[[web.Request], web.Response], failures: Failures) -> Any:
+def guard(
+    access: AccessPolicy, login: Callable[[web.Request], web.Response], failures: FailedLogins
+) -> Any:
     """The middleware. `login` makes the answer to a person who has no session yet."""
 
     @web.middleware
@@ -190,7 +194,7 @@ def guard(access: Access, login: Callable[[web.Request], web.Response], failures
                 text="This Host is not allowed: open the pages by this machine's address or as "
                 "http://localhost, or name the host in web.allowed_hosts."
             )
-        if not _from_here(request):
+        if not _is_same_origin(request):
             raise web.HTTPForbidden(text="Another site may not do this: open the page itself.")
         if (request.content_length or 0) > MAX_BODY:
             raise web.HTTPRequestEntityTooLarge(
@@ -202,16 +206,18 @@ def guard(access: Access, login: Callable[[web.Request], web.Response], failures
             return await handler(request)
         scheme, _, given = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
         if scheme.lower() == "bearer":
-            try_token(access, failures, request, given.strip())
+            check_token(access, failures, request, given.strip())
             return await handler(request)
         return login(request)
 
     return check
 
 
-def try_token(access: Access, failures: Failures, request: web.Request, given: str) -> None:
+def check_token(
+    access: AccessPolicy, failures: FailedLogins, request: web.Request, given: str
+) -> None:
     """Raises HTTPTooManyRequests or HTTPUnauthorized unless `given` is the token."""
-    address = _neighbourhood(request.remote or "")
+    address = _rate_limit_key(request.remote or "")
     wait_s = failures.wait_s(address)
     if wait_s > 0:
         raise web.HTTPTooManyRequests(
@@ -226,12 +232,16 @@ def try_token(access: Access, failures: Failures, request: web.Request, given: s
         )
 
 
-def _from_here(request: web.Request) -> bool:
+def _is_same_origin(request: web.Request) -> bool:
     """Whether the request is of our own pages, a person's, or a program's; not another site's."""
     headers = request.headers
     changes = request.method not in _SAFE_METHODS or hdrs.UPGRADE in headers
     origin = headers.get(hdrs.ORIGIN)
-    if changes and origin is not None and not _same_place(origin, headers.get(hdrs.HOST, "")):
+    if (
+        changes
+        and origin is not None
+        and not _origin_matches_host(origin, headers.get(hdrs.HOST, ""))
+    ):
         return False
     site = headers.get("Sec-Fetch-Site")
     if site is None or site == "same-origin":
@@ -243,7 +253,7 @@ def _from_here(request: web.Request) -> bool:
     return site == "none" or (opened and headers.get("Sec-Fetch-Dest") == "document")
 
 
-def _same_place(origin: str, host: str) -> bool:
+def _origin_matches_host(origin: str, host: str) -> bool:
     try:
         parts = urlsplit(origin)
     except ValueError:
@@ -259,7 +269,7 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def _neighbourhood(address: str) -> str:
+def _rate_limit_key(address: str) -> str:
     """An IPv4 address, or the /64 of an IPv6 address, all of which one visitor may have."""
     try:
         found = ipaddress.ip_address(address.partition("%")[0])

@@ -12,24 +12,24 @@ from aiohttp import web
 from bikeped.config import WebConfig
 from bikeped.errors import BikepedError
 from bikeped.telemetry.http_server import HttpServer
-from bikeped.web.security import open_access
-from bikeped.web.server import make_pages
+from bikeped.web.security import load_access_policy
+from bikeped.web.server import make_application
 
 
 def serve_pages(
     config: WebConfig,
-    *adders: Callable[[web.Application], None],
+    *page_adders: Callable[[web.Application], None],
     announce: Callable[[str], None],
     base_dir: Path = Path(),
     source: str = "web",
 ) -> None:
-    """Serves the pages that `adders` add until SIGINT or SIGTERM; `announce` gets the address.
+    """Serves the pages that `page_adders` add until SIGINT or SIGTERM; `announce` gets the address.
 
     Raises ConfigError when others could reach them without a token, BikepedError when the port
     cannot be bound.
     """
-    access = open_access(config, base_dir, source)
-    asyncio.run(_serve(config, make_pages(access, *adders), announce))
+    access = load_access_policy(config, base_dir, source)
+    asyncio.run(_serve(config, make_application(access, *page_adders), announce))
 
 
 async def _serve(config: WebConfig, app: web.Application, announce: Callable[[str], None]) -> None:

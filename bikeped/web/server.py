@@ -23,11 +23,11 @@ from bikeped.web.security import (
     HEADERS,
     MAX_BODY,
     SESSION_S,
-    Access,
-    Failures,
+    AccessPolicy,
+    FailedLogins,
     Handler,
+    check_token,
     guard,
-    try_token,
 )
 
 log = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ class Page:
 
 
 _PAGES: web.AppKey[list[Page]] = web.AppKey("pages", list)
-_ACCESS: web.AppKey[Access] = web.AppKey("access", Access)
+_ACCESS: web.AppKey[AccessPolicy] = web.AppKey("access", AccessPolicy)
 _FILES: web.AppKey[dict[str, _File]] = web.AppKey("files", dict)
 
 
@@ -80,18 +80,20 @@ class _File:
     etag: str
 
 
-def make_pages(access: Access, *adders: Callable[[web.Application], None]) -> web.Application:
-    """The application: each of `adders` adds its page and routes to it."""
-    failures = Failures()
+def make_application(
+    access: AccessPolicy, *page_adders: Callable[[web.Application], None]
+) -> web.Application:
+    """The application: each of `page_adders` adds its page and routes to it."""
+    failures = FailedLogins()
 
     def login(request: web.Request) -> web.Response:
-        return _ask_for_token(request, access, failures)
+        return _answer_without_session(request, access, failures)
 
     app = web.Application(
         middlewares=[guard(access, login, failures), _errors], client_max_size=MAX_BODY
     )
     app[_PAGES], app[_ACCESS], app[_FILES] = [], access, _load_static(WEB_FOLDER)
-    app.on_response_prepare.append(_harden)
+    app.on_response_prepare.append(_set_security_headers)
     app.router.add_get("/static/{name:.+}", _static)
     app.router.add_get("/favicon.ico", _favicon)
     app.router.add_get("/session", _session)
@@ -102,7 +104,7 @@ def make_pages(access: Access, *adders: Callable[[web.Application], None]) -> we
 
     app.router.add_post("/login", log_in)
     app.router.add_post("/logout", _log_out)
-    for add in adders:
+    for add in page_adders:
         add(app)
     paths = [page.path for page in app[_PAGES]]
     if paths and "/" not in paths:
@@ -162,7 +164,7 @@ async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
         return json_answer({"error": "this is a bug in bikeped: its log says more"}, 500)
 
 
-async def _harden(_request: web.Request, response: web.StreamResponse) -> None:
+async def _set_security_headers(_request: web.Request, response: web.StreamResponse) -> None:
     for name, value in HEADERS.items():
         response.headers.setdefault(name, value)
     response.headers.setdefault(hdrs.CACHE_CONTROL, "no-store")
@@ -235,7 +237,9 @@ _REFUSED = Page("/login", "Log in", "Log in: not the token", "login-refused.html
 _WAIT = Page("/login", "Log in", "Log in: please wait", "login-wait.html")
 
 
-def _ask_for_token(request: web.Request, access: Access, failures: Failures) -> web.Response:
+def _answer_without_session(
+    request: web.Request, access: AccessPolicy, failures: FailedLogins
+) -> web.Response:
     """The answer to somebody without a session: a link's token is taken, others are asked."""
     wants_page = request.method == hdrs.METH_GET and "text/html" in request.headers.get(
         "Accept", ""
@@ -247,16 +251,16 @@ def _ask_for_token(request: web.Request, access: Access, failures: Failures) -> 
         )
     if "token" not in request.query:
         return _page(request, _LOGIN, 401)
-    refused = _refusal(request, access, failures, request.query["token"])
-    return refused or _welcome(request, access, request.path)
+    refused = _login_refusal(request, access, failures, request.query["token"])
+    return refused or _start_session(request, access, request.path)
 
 
-def _refusal(
-    request: web.Request, access: Access, failures: Failures, given: str
+def _login_refusal(
+    request: web.Request, access: AccessPolicy, failures: FailedLogins, given: str
 ) -> web.Response | None:
     """The page that says why `given` does not let a person in; None when it does."""
     try:
-        try_token(access, failures, request, given)
+        check_token(access, failures, request, given)
     except web.HTTPTooManyRequests as error:
         answer = _page(request, _WAIT, error.status)
         answer.headers[hdrs.RETRY_AFTER] = error.headers[hdrs.RETRY_AFTER]
@@ -266,7 +270,7 @@ def _refusal(
     return None
 
 
-def _welcome(request: web.Request, access: Access, path: str) -> web.Response:
+def _start_session(request: web.Request, access: AccessPolicy, path: str) -> web.Response:
     """Sets the cookie and leads on to `path`.
 
     Not by a redirect: a browser that came here from another site (a link in a mail) does not send a
@@ -290,14 +294,16 @@ async def _login_form(request: web.Request) -> web.Response:
     return _page(request, _LOGIN)
 
 
-async def _log_in(request: web.Request, access: Access, failures: Failures) -> web.Response:
+async def _log_in(
+    request: web.Request, access: AccessPolicy, failures: FailedLogins
+) -> web.Response:
     try:
         form = await asyncio.wait_for(request.post(), _BODY_S)
     except asyncio.TimeoutError as error:
         raise web.HTTPRequestTimeout(text="The form did not arrive.") from error
     token, path = form.get("token"), form.get("next")
-    refused = _refusal(request, access, failures, token if isinstance(token, str) else "")
-    return refused or _welcome(request, access, path if isinstance(path, str) else "/")
+    refused = _login_refusal(request, access, failures, token if isinstance(token, str) else "")
+    return refused or _start_session(request, access, path if isinstance(path, str) else "/")
 
 
 async def _log_out(_request: web.Request) -> web.StreamResponse:

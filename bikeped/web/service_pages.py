@@ -15,8 +15,8 @@ from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align
 from bikeped.web.live import LivePage, add_live
 from bikeped.web.live_state import LiveState
-from bikeped.web.security import open_access
-from bikeped.web.server import make_pages
+from bikeped.web.security import load_access_policy
+from bikeped.web.server import make_application
 
 
 class ServicePages:
@@ -26,7 +26,7 @@ class ServicePages:
     """
 
     def __init__(self, loaded: LoadedConfig) -> None:
-        self._access = open_access(loaded.config.web, loaded.base_dir, loaded.source)
+        self._access = load_access_policy(loaded.config.web, loaded.base_dir, loaded.source)
         self.state = LiveState()
 
     async def frame(self, outcome: Outcome) -> None:
@@ -36,7 +36,7 @@ class ServicePages:
         self.state.signal(signal, sentence, decision)
 
     def application(self, inside: Inside) -> web.Application:
-        app = make_pages(
+        app = make_application(
             self._access,
             partial(add_live, live=LivePage(self.state, inside)),
             partial(add_align, loaded=inside.loaded, frame=self.newest),

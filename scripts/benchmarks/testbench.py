@@ -99,13 +99,13 @@ class _Served:
         from bikeped.config import WebConfig
         from bikeped.lab.testbench.pages import add_testbench
         from bikeped.telemetry.http_server import HttpServer
-        from bikeped.web.security import open_access
-        from bikeped.web.server import make_pages
+        from bikeped.web.security import load_access_policy
+        from bikeped.web.server import make_application
 
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         config = WebConfig(port=0)
-        app = make_pages(
-            open_access(config),
+        app = make_application(
+            load_access_policy(config),
             lambda app: add_testbench(app, *self._made),  # type: ignore[arg-type]
         )
         self._server = HttpServer(app, config)

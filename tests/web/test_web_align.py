@@ -18,7 +18,7 @@ from bikeped.types import Frame
 from bikeped.web.align import add_align
 from bikeped.web.align_grid import ground_grid
 from bikeped.web.align_points import values_of
-from bikeped.web.server import make_pages
+from bikeped.web.server import make_application
 from bikeped.web.service_pages import ServicePages
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +62,7 @@ class Site:
     ) -> None:
         self.loaded = load_config(config, overrides)
         self.newest: Frame | bytes | None = None
-        self.app = make_pages(
+        self.app = make_application(
             access, lambda app: add_align(app, self.loaded, lambda: self.newest, live=live)
         )
 

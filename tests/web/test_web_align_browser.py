@@ -16,7 +16,7 @@ from web_fakes import OPEN, PHONE
 
 from bikeped.config import load_config
 from bikeped.web.align import add_align
-from bikeped.web.server import make_pages
+from bikeped.web.server import make_application
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def align(scene: Scene, serve: Callable[..., str], open_page: Callable[..., Page
     def open_align(live: bool = False, **options) -> Page:
         loaded = load_config(scene.config)
         url = serve(
-            lambda: make_pages(
+            lambda: make_application(
                 OPEN, lambda app: add_align(app, loaded, lambda: scene.jpeg, live=live)
             )
         )

@@ -24,7 +24,7 @@ from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.web.live import LivePage, add_live, display_source
 from bikeped.web.live_state import ALERTS, TREND_S, LiveState
-from bikeped.web.server import make_pages
+from bikeped.web.server import make_application
 from bikeped.web.service_pages import ServicePages
 
 PATIENCE_S = 20.0
@@ -38,7 +38,7 @@ class Page:
         self.state = LiveState()
         self.live = LivePage(self.state, within)
         self.scene = Scene(within.judge)
-        app = make_pages(OPEN, partial(add_live, live=self.live))
+        app = make_application(OPEN, partial(add_live, live=self.live))
         self.server = HttpServer(app, within.loaded.config.web)
         self.url = ""
 

@@ -25,7 +25,7 @@ from bikeped.pipeline.replay import ReplayFiles, ReplayResult, replay
 from bikeped.telemetry.builders import parse_event
 from bikeped.web.live import LivePage, add_live
 from bikeped.web.live_state import LiveState
-from bikeped.web.server import make_pages
+from bikeped.web.server import make_application
 from bikeped.web.service_pages import ServicePages
 
 PATIENCE_S = 60.0
@@ -181,7 +181,7 @@ class Told:
 
     def _make(self) -> web.Application:
         self.live = LivePage(self.state, self.within)
-        app = make_pages(OPEN, partial(add_live, live=self.live))
+        app = make_application(OPEN, partial(add_live, live=self.live))
 
         async def begin(_app: web.Application) -> None:
             self._task = asyncio.create_task(self._tick())

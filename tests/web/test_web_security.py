@@ -18,8 +18,15 @@ from web_fakes import LOCKED, OPEN, TOKEN
 from bikeped.config import WebConfig, parse_config
 from bikeped.errors import ConfigError
 from bikeped.telemetry.http_server import HttpServer
-from bikeped.web.security import COOKIE, MAX_BODY, SESSION_S, Access, Failures, open_access
-from bikeped.web.server import Page, add_page, make_pages
+from bikeped.web.security import (
+    COOKIE,
+    MAX_BODY,
+    SESSION_S,
+    AccessPolicy,
+    FailedLogins,
+    load_access_policy,
+)
+from bikeped.web.server import Page, add_page, make_application
 
 HTML = {"Accept": "text/html"}
 
@@ -52,8 +59,8 @@ Start = Callable[..., Any]
 async def start() -> AsyncIterator[Start]:
     servers: list[HttpServer] = []
 
-    async def begin(access: Access = OPEN) -> str:
-        servers.append(HttpServer(make_pages(access, add_probe), WebConfig(port=0)))
+    async def begin(access: AccessPolicy = OPEN) -> str:
+        servers.append(HttpServer(make_application(access, add_probe), WebConfig(port=0)))
         assert await servers[-1].start()
         return f"http://127.0.0.1:{servers[-1].port}"
 
@@ -97,7 +104,7 @@ def test_bound_for_others_plain_addresses_and_own_names_are_answered_to(tmp_path
     monkeypatch.setattr("socket.gethostname", lambda: "Pole7")
     (tmp_path / "token").write_text(TOKEN + "\n")
     config = WebConfig(host="0.0.0.0", token_file="token", allowed_hosts=("Crossing.example",))
-    access = open_access(config, tmp_path)
+    access = load_access_policy(config, tmp_path)
     for host in ("192.168.1.7:8080", "[fe80::1]:80", "pole7", "pole7.local:8080", "localhost"):
         assert access.knows_host(host), host
     assert access.knows_host("crossing.example:8080")
@@ -311,9 +318,9 @@ def test_cookies_end_with_their_time_and_with_the_token():
     assert not LOCKED.is_cookie(cookie, 1.7e9 + SESSION_S)
     later = f"{int(cookie.split('.')[0]) + 1}.{cookie.split('.')[1]}"
     assert not LOCKED.is_cookie(later, 1.7e9)
-    assert not Access(LOCKED.names, token="another-long-token").is_cookie(cookie, 1.7e9)
+    assert not AccessPolicy(LOCKED.names, token="another-long-token").is_cookie(cookie, 1.7e9)
     assert not OPEN.is_cookie(cookie, 1.7e9)
-    assert Access(frozenset(), token=TOKEN).is_cookie(cookie, 1.7e9)  # a restart keeps it
+    assert AccessPolicy(frozenset(), token=TOKEN).is_cookie(cookie, 1.7e9)  # a restart keeps it
 
 
 @given(st.text())
@@ -343,7 +350,7 @@ async def test_guessing_is_slowed_down_and_the_right_token_waits_too(start):
 
 def test_failures_are_forgotten_and_bounded():
     now_s = [0.0]
-    failures = Failures(per_address=2, overall=5, window_s=60, clock=lambda: now_s[0])
+    failures = FailedLogins(per_address=2, overall=5, window_s=60, clock=lambda: now_s[0])
     assert failures.wait_s("a") == 0
     failures.count("a")
     now_s[0] = 10.0
@@ -424,7 +431,7 @@ def test_pages_for_others_need_a_token(host):
     with pytest.raises(ConfigError, match=r"c\.yaml: web\.host: .*set web\.token_file too"):
         parse_config(text, "c.yaml", Path())
     with pytest.raises(ConfigError, match=r"web\.token_file"):
-        open_access(WebConfig(host=host))
+        load_access_policy(WebConfig(host=host))
     for fine in ("enabled: false", "enabled: true, token_file: t"):
         parse_config(f"{camera}web: {{host: '{host}', {fine}}}\n", "c.yaml", Path())
 
@@ -443,10 +450,10 @@ def test_a_token_file_that_cannot_be_used_is_said(tmp_path, content, said):
     if content is not None:
         (tmp_path / "token").write_bytes(content)
     with pytest.raises(ConfigError, match=rf"token: web\.token_file.*{said}"):
-        open_access(WebConfig(token_file="token"), tmp_path)
+        load_access_policy(WebConfig(token_file="token"), tmp_path)
 
 
 def test_the_first_line_of_the_file_is_the_token(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\r\nsomething else\n")
-    access = open_access(WebConfig(token_file=str(tmp_path / "token")))
+    access = load_access_policy(WebConfig(token_file=str(tmp_path / "token")))
     assert access.is_token(TOKEN)

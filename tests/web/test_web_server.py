@@ -23,7 +23,7 @@ from bikeped.config import WebConfig
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.web.serve import serve_pages
-from bikeped.web.server import Page, add_page, json_answer, json_body, make_pages
+from bikeped.web.server import Page, add_page, json_answer, json_body, make_application
 
 WEB = Path(__file__).parents[2] / "bikeped" / "web"
 STATIC, TEMPLATES = WEB / "static", WEB / "templates"
@@ -54,7 +54,7 @@ def add_parts(app: web.Application) -> None:
 
 @pytest.fixture
 async def base() -> AsyncIterator[str]:
-    server = HttpServer(make_pages(OPEN, add_parts), WebConfig(port=0))
+    server = HttpServer(make_application(OPEN, add_parts), WebConfig(port=0))
     assert await server.start()
     yield f"http://127.0.0.1:{server.port}"
     await server.stop()

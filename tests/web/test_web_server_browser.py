@@ -10,7 +10,7 @@ from aiohttp import web
 from playwright.sync_api import Error, expect
 from web_fakes import DESKTOP, LOCKED, OPEN, PHONE, TOKEN
 
-from bikeped.web.server import Page, add_page, make_pages
+from bikeped.web.server import Page, add_page, make_application
 
 EMPTY = '<!doctype html><title>x</title><link rel="icon" href="data:,">'
 
@@ -22,12 +22,12 @@ def add_two(app: web.Application) -> None:
 
 @pytest.fixture
 def url(serve: Any) -> str:
-    return serve(partial(make_pages, OPEN, add_two))
+    return serve(partial(make_application, OPEN, add_two))
 
 
 @pytest.fixture
 def locked(serve: Any) -> str:
-    return serve(partial(make_pages, LOCKED, add_two))
+    return serve(partial(make_application, LOCKED, add_two))
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

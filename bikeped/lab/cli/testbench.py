@@ -20,7 +20,7 @@ from bikeped.lab.cli.governance_tables import print_contest
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 
 if TYPE_CHECKING:
-    from bikeped.lab.testbench.settings import Bench
+    from bikeped.lab.testbench.settings import BenchSettings
 
 
 @click.group("testbench", invoke_without_command=True)
@@ -50,7 +50,7 @@ def command(
         return
     import msgspec
 
-    from bikeped.lab.testbench.contest import Origin
+    from bikeped.lab.testbench.contest import InvocationOptions
     from bikeped.lab.testbench.pages import add_testbench
     from bikeped.web.serve import serve_pages
 
@@ -60,7 +60,7 @@ def command(
         web = msgspec.structs.replace(web, port=port)
     if host is not None:
         web = msgspec.structs.replace(web, host=host)
-    origin = Origin(config_path, scenarios_dir, overrides)
+    origin = InvocationOptions(config_path, scenarios_dir, overrides)
     screen = console()
     serve_pages(
         web,
@@ -90,18 +90,20 @@ def contest(
 
     FILE_OR_LINK is the file, or the page's address with all that follows its #.
     """
-    from bikeped.lab.testbench.contest import Origin
+    from bikeped.lab.testbench.contest import InvocationOptions
     from bikeped.lab.testbench.contest import challenge as run
-    from bikeped.lab.testbench.run import Workbench, trial_summaries
-    from bikeped.lab.testbench.settings import in_force, parse_link
+    from bikeped.lab.testbench.run import BenchRunner, trial_summaries
+    from bikeped.lab.testbench.settings import settings_from_link, settings_in_force
 
     file = _as_file(challenge)
     loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
-    bench = parse_link(challenge, in_force(loaded)) if file is None else _read(file)
-    work = Workbench(loaded, scenarios)
+    bench = (
+        settings_from_link(challenge, settings_in_force(loaded)) if file is None else _read(file)
+    )
+    work = BenchRunner(loaded, scenarios)
     found = run(work, bench).as_dict()
     trials = trial_summaries(work.whole(bench), bench)
-    origin = Origin(config_path, scenarios_dir, overrides)
+    origin = InvocationOptions(config_path, scenarios_dir, overrides)
     words = shlex.join(["bikeped", "testbench", "contest", challenge, *origin.options()])
     if json_path is not None:
         write_json({"command": words, **found, "trials": trials}, json_path)
@@ -131,11 +133,11 @@ def export(
 
     It opens from the disk without a network, to be mailed or printed.
     """
-    from bikeped.lab.testbench.export import make_report
+    from bikeped.lab.testbench.export import render_report
 
     loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
     with progress_bar("scenarios", len(scenarios)) as tell:
-        page = make_report(loaded, scenarios, _again(config_path, overrides, scenarios_dir), tell)
+        page = render_report(loaded, scenarios, _again(config_path, overrides, scenarios_dir), tell)
     write_whole(out, page)
     size_mb = len(page.encode()) / 1e6
     if json_path is not None:
@@ -160,13 +162,13 @@ def _as_file(challenge: str) -> Path | None:
     return None
 
 
-def _read(path: Path) -> Bench:
-    from bikeped.lab.testbench.settings import parse_file
+def _read(path: Path) -> BenchSettings:
+    from bikeped.lab.testbench.settings import settings_from_file
 
     try:
         if path.stat().st_size > 1_000_000:
             raise BikepedError(f"{path}: larger than 1 MB; a challenge is a short text")
-        return parse_file(path.read_bytes(), str(path))
+        return settings_from_file(path.read_bytes(), str(path))
     except OSError as error:
         raise BikepedError(f"{path}: cannot be read ({error.strerror}); check the path") from error
 

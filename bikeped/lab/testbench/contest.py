@@ -20,12 +20,18 @@ from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.lab.governance.contest import Contest, Side, contest
 from bikeped.lab.governance.gates import check
-from bikeped.lab.testbench.run import Workbench
-from bikeped.lab.testbench.settings import VIEW, Bench, file_of, in_force, link_of
+from bikeped.lab.testbench.run import BenchRunner
+from bikeped.lab.testbench.settings import (
+    VIEW,
+    BenchSettings,
+    settings_in_force,
+    settings_to_file,
+    settings_to_link,
+)
 
 
 @dataclass(frozen=True)
-class Origin:
+class InvocationOptions:
     """Where the bench was started from: what a command line must repeat."""
 
     config: Path | None = None
@@ -40,19 +46,21 @@ class Origin:
         return words
 
 
-def challenge(work: Workbench, bench: Bench) -> Contest:
+def challenge(work: BenchRunner, bench: BenchSettings) -> Contest:
     """Runs both sides."""
-    before = work.whole(in_force(work.loaded))
+    before = work.whole(settings_in_force(work.loaded))
     after = before if _same_run(work, bench) else work.whole(bench)
     return contest(before, work.loaded.config.decision, after, bench.decision)
 
 
-def _same_run(work: Workbench, bench: Bench) -> bool:
-    base = in_force(work.loaded)
+def _same_run(work: BenchRunner, bench: BenchSettings) -> bool:
+    base = settings_in_force(work.loaded)
     return msgspec.structs.replace(bench, decision=base.decision, scenario="", beside=()) == base
 
 
-def contest_answer(work: Workbench, bench: Bench, origin: Origin) -> dict[str, Any]:
+def comparison_json(
+    work: BenchRunner, bench: BenchSettings, origin: InvocationOptions
+) -> dict[str, Any]:
     """The contest for the page: figures, gates in words, strips, and how to repeat it."""
     found = challenge(work, bench)
     data = found.as_dict()
@@ -60,13 +68,13 @@ def contest_answer(work: Workbench, bench: Bench, origin: Origin) -> dict[str, A
         for told, gate in zip(data[key]["gates"], check(side.metrics), strict=True):
             told["rule"], told["shown"] = gate.rule, gate.say(gate.measured)
     data["strips"] = [_strip(found, name) for name in found.after.suite.names]
-    base = in_force(work.loaded)
-    data["link"] = link_of(bench, base)
+    base = settings_in_force(work.loaded)
+    data["link"] = settings_to_link(bench, base)
     data["changes"] = changes(bench, base)
     data["command"] = command_line(bench, base, origin)
     again = ["bikeped", "testbench", "contest", "challenge.json", *origin.options()]
     data["again"] = shlex.join(again)
-    data["file"] = file_of(bench, base, facts(work.loaded))
+    data["file"] = settings_to_file(bench, base, facts(work.loaded))
     return data
 
 
@@ -81,7 +89,7 @@ def facts(loaded: LoadedConfig) -> dict[str, str | None]:
     }
 
 
-def changes(bench: Bench, base: Bench) -> list[dict[str, Any]]:
+def changes(bench: BenchSettings, base: BenchSettings) -> list[dict[str, Any]]:
     """What the bench sets otherwise than the configuration in force: key, before, after."""
     now, before = msgspec.to_builtins(bench), msgspec.to_builtins(base)
     found = []
@@ -102,7 +110,9 @@ def changes(bench: Bench, base: Bench) -> list[dict[str, Any]]:
     return found
 
 
-def command_line(bench: Bench, base: Bench, origin: Origin) -> str | None:
+def command_line(
+    bench: BenchSettings, base: BenchSettings, origin: InvocationOptions
+) -> str | None:
     """The `bikeped conformance contest` of this challenge; None where that command cannot say it.
 
     It knows the configuration's keys and the truth's thresholds. What the bench alone has (misses,

@@ -34,8 +34,8 @@ from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.testbench.contest import runs
 from bikeped.lab.testbench.pages import configurations
 from bikeped.lab.testbench.playback import coverage, playback
-from bikeped.lab.testbench.run import BenchSuite, Workbench
-from bikeped.lab.testbench.settings import in_force
+from bikeped.lab.testbench.run import BenchRunner, BenchSuite
+from bikeped.lab.testbench.settings import settings_in_force
 from bikeped.templates import render
 from bikeped.web.server import WEB_FOLDER
 
@@ -56,15 +56,15 @@ _STYLES = ("app.css", "testbench.css", "report.css")
 _DIGITS = 2
 
 
-def make_report(
+def render_report(
     loaded: LoadedConfig,
     scenarios: Sequence[Scenario],
     command: str,
     tell: Callable[[int], None] = lambda done: None,
 ) -> str:
     """The page of the configuration in force. `command` makes it again; `tell` counts scenarios."""
-    work = Workbench(loaded, scenarios)
-    suite = work.whole(in_force(loaded))
+    work = BenchRunner(loaded, scenarios)
+    suite = work.whole(settings_in_force(loaded))
     named = configurations(loaded)
     decision = loaded.config.decision
     found = {

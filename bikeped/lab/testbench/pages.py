@@ -1,10 +1,10 @@
 """`/testbench`: the simulation behind a page. The page draws; every number is computed here, by the
 deployed rule and the conformance code.
 
-Requests are JSON: a whole `Bench` and the page's own name. Of each kind (a scenario, the suite, its
-trials) one answer is computed at a time, in a thread, so that a slider does not wait for the suite;
-of a page's waiting requests only the newest is answered (the others get status 409), and of many
-pages' only so many wait (503).
+A request is JSON: the whole `BenchSettings` and an identifier of the browser page. Of each kind (a
+scenario, the suite, its trials) one answer is computed at a time, in a thread: a slider does not
+wait for the suite. Of a page's waiting requests only the newest is answered (the others get
+status 409); when too many pages wait, the answer is status 503.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from bikeped.config.schema.base import Section
 from bikeped.lab.experiments.optimizer import BOUNDS
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.lab.testbench.contest import Origin, contest_answer
+from bikeped.lab.testbench.contest import InvocationOptions, comparison_json
 from bikeped.lab.testbench.playback import TESTS, TIERS, coverage, playback
-from bikeped.lab.testbench.run import Workbench, trial_summaries
+from bikeped.lab.testbench.run import BenchRunner, trial_summaries
 from bikeped.lab.testbench.settings import (
     MAX_SCRIPT_CHARS,
-    Bench,
-    check_bench,
-    in_force,
-    link_of,
-    parse_file,
-    parse_link,
-    parse_own,
+    BenchSettings,
+    check_settings,
+    parse_custom_scenario,
+    settings_from_file,
+    settings_from_link,
+    settings_in_force,
+    settings_to_link,
 )
 from bikeped.web.server import Page, add_page, json_answer, json_body
 
@@ -55,14 +55,14 @@ PAGE = Page(
 )
 
 
-class Ask(Section, frozen=True):
+class BenchRequest(Section, frozen=True):
     """A request about a bench. `client` tells pages apart."""
 
-    bench: Bench
+    bench: BenchSettings
     client: Annotated[str, Meta(max_length=40)] = ""
 
 
-class Text(Section, frozen=True):
+class TextRequest(Section, frozen=True):
     """A text that somebody brought: a scenario file, a challenge, a link."""
 
     text: Annotated[str, Meta(max_length=900_000)]
@@ -73,21 +73,21 @@ def add_testbench(
     app: web.Application,
     loaded: LoadedConfig,
     scenarios: Sequence[Scenario],
-    origin: Origin = Origin(),  # noqa: B008 - immutable
+    origin: InvocationOptions = InvocationOptions(),  # noqa: B008 - immutable
 ) -> None:
     """Adds the page and its API; `loaded` is the configuration in force, `scenarios` the suite."""
     # One for the scenario shown and one for the suite: neither waits for what the other keeps.
-    shown, work = Workbench(loaded, scenarios), Workbench(loaded, scenarios)
-    desks = {kind: Desk() for kind in ("scenario", "suite", "trials")}
+    shown, work = BenchRunner(loaded, scenarios), BenchRunner(loaded, scenarios)
+    desks = {kind: JobQueue() for kind in ("scenario", "suite", "trials")}
     named = configurations(loaded)
-    about = msgspec.json.encode(describe(work, named))
+    about = msgspec.json.encode(page_description(work, named))
 
     async def tell(_request: web.Request) -> web.Response:
         return web.Response(body=about, content_type="application/json")
 
-    async def ask(request: web.Request, answer: Callable[[Ask], Any]) -> web.Response:
-        found = await json_body(request, Ask)
-        check_bench(found.bench)
+    async def ask(request: web.Request, answer: Callable[[BenchRequest], Any]) -> web.Response:
+        found = await json_body(request, BenchRequest)
+        check_settings(found.bench)
         desk = desks[request.path.rsplit("/", 1)[-1]]
         body = await desk.ask(found.client, lambda: msgspec.json.encode(answer(found)))
         return web.Response(
@@ -95,10 +95,10 @@ def add_testbench(
         )
 
     async def scenario(request: web.Request) -> web.Response:
-        return await ask(request, lambda found: scenario_answer(shown, found, named))
+        return await ask(request, lambda found: scenario_json(shown, found, named))
 
     async def suite(request: web.Request) -> web.Response:
-        return await ask(request, lambda found: contest_answer(work, found.bench, origin))
+        return await ask(request, lambda found: comparison_json(work, found.bench, origin))
 
     async def trials(request: web.Request) -> web.Response:
         return await ask(
@@ -107,20 +107,20 @@ def add_testbench(
         )
 
     async def read_scenario(request: web.Request) -> web.Response:
-        found = await json_body(request, Text)
+        found = await json_body(request, TextRequest)
         if len(found.text) > MAX_SCRIPT_CHARS:
             raise web.HTTPRequestEntityTooLarge(MAX_SCRIPT_CHARS, len(found.text))
-        one = await asyncio.to_thread(parse_own, found.text, found.name)
+        one = await asyncio.to_thread(parse_custom_scenario, found.text, found.name)
         return json_answer({"script": script(one), "text": dump_scenario(one)})
 
     async def read_challenge(request: web.Request) -> web.Response:
-        found = await json_body(request, Text)
-        base = in_force(loaded)
+        found = await json_body(request, TextRequest)
+        base = settings_in_force(loaded)
         if found.text.lstrip().startswith("{"):
-            bench = parse_file(found.text, found.name)
+            bench = settings_from_file(found.text, found.name)
         else:
-            bench = parse_link(found.text, base)
-        return json_answer({"bench": bench, "link": link_of(bench, base)})
+            bench = settings_from_link(found.text, base)
+        return json_answer({"bench": bench, "link": settings_to_link(bench, base)})
 
     add_page(app, PAGE)
     app.router.add_get("/testbench/about", tell)
@@ -138,8 +138,8 @@ def configurations(loaded: LoadedConfig) -> dict[str, DecisionConfig]:
     return {"configured": loaded.config.decision, **CONFIGURATIONS}
 
 
-def scenario_answer(
-    work: Workbench, asked: Ask, named: dict[str, DecisionConfig]
+def scenario_json(
+    work: BenchRunner, asked: BenchRequest, named: dict[str, DecisionConfig]
 ) -> dict[str, Any]:
     """The playback of the scenario shown, for the bench's decision and those beside it."""
     bench = asked.bench
@@ -153,7 +153,7 @@ def scenario_answer(
     return {
         **playback(suite, 0, sides),
         "cameras": views,
-        "link": link_of(bench, in_force(work.loaded)),
+        "link": settings_to_link(bench, settings_in_force(work.loaded)),
         "script": script(suite.scenarios[0]),
     }
 
@@ -182,9 +182,9 @@ def _size(size_m: tuple[float, float, float]) -> dict[str, float]:
     return dict(zip(("length", "width", "height"), size_m, strict=True))
 
 
-def describe(work: Workbench, named: dict[str, DecisionConfig]) -> dict[str, Any]:
+def page_description(work: BenchRunner, named: dict[str, DecisionConfig]) -> dict[str, Any]:
     """What the page needs once: scenarios, configurations, ranges, and which code decides."""
-    base = in_force(work.loaded)
+    base = settings_in_force(work.loaded)
     suite: Suite = work.whole(base)
     return {
         "version": __version__,
@@ -192,7 +192,7 @@ def describe(work: Workbench, named: dict[str, DecisionConfig]) -> dict[str, Any
         "suite_hash": suite.hash,
         "config_hash": work.loaded.hash,
         "base": base,
-        "link": link_of(base, base),
+        "link": settings_to_link(base, base),
         "configurations": named,
         "in_force": next(n for n, d in named.items() if d == base.decision),
         "tests": list(TESTS),
@@ -215,15 +215,15 @@ def describe(work: Workbench, named: dict[str, DecisionConfig]) -> dict[str, Any
 
 
 def ranges() -> dict[str, Any]:
-    """Every number's bounds and meaning, by key: what `Bench` itself checks."""
-    schema = msgspec.json.schema(Bench)["$defs"]
+    """Every number's bounds and meaning, by key: what `BenchSettings` itself checks."""
+    schema = msgspec.json.schema(BenchSettings)["$defs"]
     found: dict[str, Any] = {}
     for section, name in (
         ("camera", "Mount"),
         ("decision", "DecisionConfig"),
         ("perception", "Perception"),
         ("delay", "Delay"),
-        ("danger", "Danger"),
+        ("danger", "GroundTruthThresholds"),
     ):
         for key, told in schema[name]["properties"].items():
             found[f"{section}.{key}"] = {
@@ -235,7 +235,7 @@ def ranges() -> dict[str, Any]:
     return found
 
 
-class Desk:
+class JobQueue:
     """One job at a time, in a thread; of each client's waiting jobs only the newest is done."""
 
     def __init__(self, most_waiting: int = _MOST_WAITING) -> None:

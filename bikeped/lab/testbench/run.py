@@ -29,12 +29,12 @@ from bikeped.lab.simulation.simulate import Run, Scene, Tracked, delayed, rows_o
 from bikeped.lab.simulation.suite import Suite
 from bikeped.lab.simulation.truth import Truth, TruthSettings, judge_truth
 from bikeped.lab.testbench.settings import (
-    Bench,
+    BenchSettings,
     Delay,
     Perception,
-    mounted,
-    own_scenarios,
-    parse_own,
+    camera_with_mount,
+    custom_scenarios,
+    parse_custom_scenario,
 )
 
 T = TypeVar("T")
@@ -107,7 +107,7 @@ class BenchSuite(Suite):
 _KEPT = ("names", "seen", "seen_second", "observed", "scenes_seen", "tracked", "run", "hash")
 
 
-def trial_summaries(suite: BenchSuite, bench: Bench) -> dict[str, Any] | None:
+def trial_summaries(suite: BenchSuite, bench: BenchSettings) -> dict[str, Any] | None:
     """Means over the bench's trials with their 95 % intervals; None when nobody is missed.
 
     In order of names, as `conformance montecarlo` counts: the same figures.
@@ -139,37 +139,37 @@ def check_work(scenarios: Sequence[Scenario], repeats: int = 1) -> None:
         )
 
 
-class Workbench:
+class BenchRunner:
     """Runs benches, and keeps what the last ones have in common. One at a time, in any thread."""
 
     def __init__(self, loaded: LoadedConfig, scenarios: Sequence[Scenario]) -> None:
         self.loaded, self.scenarios = loaded, tuple(scenarios)
         self._texts = {id(s): dump_scenario(s) for s in self.scenarios}
-        self._seen: _Kept[Seen] = _Kept(400)
-        self._truths: _Kept[Truth] = _Kept(400)
-        self._suites: _Kept[BenchSuite] = _Kept(12)
-        self._own: _Kept[Scenario] = _Kept(60)
+        self._seen: _LruCache[Seen] = _LruCache(400)
+        self._truths: _LruCache[Truth] = _LruCache(400)
+        self._suites: _LruCache[BenchSuite] = _LruCache(12)
+        self._own: _LruCache[Scenario] = _LruCache(60)
         self.lock = threading.RLock()
 
-    def scenarios_of(self, bench: Bench) -> tuple[Scenario, ...]:
+    def suite_scenarios(self, bench: BenchSettings) -> tuple[Scenario, ...]:
         """The suite with the bench's own scenarios, as `conformance contest --scenario` adds them:
         one of a name that is there takes its place."""
         with self.lock:
-            own = {s.name: s for s in own_scenarios(bench, self._read)}
+            own = {s.name: s for s in custom_scenarios(bench, self._read)}
         kept = [own.pop(s.name, s) for s in self.scenarios]
         return (*kept, *own.values())
 
     def _read(self, text: str, source: str) -> Scenario:
-        """As `parse_own`, but a text that was read before is not read again: YAML is slow."""
-        return self._own.get(text, lambda: parse_own(text, source))
+        """As `parse_custom_scenario`, with a cache by text: parsing YAML is slow."""
+        return self._own.get(text, lambda: parse_custom_scenario(text, source))
 
-    def whole(self, bench: Bench) -> BenchSuite:
+    def whole(self, bench: BenchSettings) -> BenchSuite:
         """The bench's suite."""
-        return self._suite(bench, self.scenarios_of(bench))
+        return self._suite(bench, self.suite_scenarios(bench))
 
-    def only(self, bench: Bench) -> BenchSuite:
+    def only(self, bench: BenchSettings) -> BenchSuite:
         """A suite of the one scenario that the bench shows."""
-        everyone = self.scenarios_of(bench)
+        everyone = self.suite_scenarios(bench)
         if not bench.scenario:
             return self._suite(bench, everyone[:1])
         found = tuple(s for s in everyone if s.name == bench.scenario)
@@ -177,10 +177,10 @@ class Workbench:
             raise BikepedError(f"scenario {bench.scenario!r}: is not there; choose another")
         return self._suite(bench, found)
 
-    def _suite(self, bench: Bench, scenarios: tuple[Scenario, ...]) -> BenchSuite:
+    def _suite(self, bench: BenchSettings, scenarios: tuple[Scenario, ...]) -> BenchSuite:
         check_work(scenarios)
         with self.lock:
-            camera = mounted(self.loaded, bench.camera)
+            camera = camera_with_mount(self.loaded, bench.camera)
             pose = bench.camera.pose()
             second = None if bench.second_camera is None else bench.second_camera.pose()
             texts = [self._text(s) for s in scenarios]
@@ -215,7 +215,7 @@ class Workbench:
         return dump_scenario(scenario) if known is None else known
 
 
-class _Kept(Generic[T]):
+class _LruCache(Generic[T]):
     """The last `most` values, made when they are asked for the first time."""
 
     def __init__(self, most: int) -> None:

@@ -1,9 +1,9 @@
-"""Everything that the test bench lets people change, with its ranges: one `Bench`.
+"""`BenchSettings`: everything that the test bench lets people change, with its ranges.
 
-A bench is what a run is made of: the scenario shown, further scenarios, the decision's numbers, how
-the camera hangs and what it misses, the delay, and what counts as danger. It travels as JSON (the
-page's requests), as a link (`link_of`, `parse_link`: only what differs from the configuration in
-force, readable) and as a file (`bikeped testbench contest FILE`); all three say the same.
+The settings of a run: the scenario shown, custom scenarios, the decision's parameters, the camera's
+mount and its misses, the delay, and the ground truth's thresholds. They travel as JSON (the page's
+requests), as a link (`settings_to_link`, `settings_from_link`: only what differs from the
+configuration in force) and as a file (`bikeped testbench contest FILE`), without loss.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Delay(Section, frozen=True):
         return delay_frames(self.delay_ms)
 
 
-class Danger(Section, frozen=True):
+class GroundTruthThresholds(Section, frozen=True):
     """The free thresholds of the ground truth (definitions, section 5)."""
 
     cpa_radius_m: Annotated[
@@ -129,14 +129,14 @@ class Danger(Section, frozen=True):
         )
 
 
-class Bench(Section, frozen=True):
+class BenchSettings(Section, frozen=True):
     """One setting of the whole bench."""
 
     camera: Mount
     decision: DecisionConfig = msgspec.field(default_factory=DecisionConfig)
     perception: Perception = msgspec.field(default_factory=Perception)
     delay: Delay = msgspec.field(default_factory=Delay)
-    danger: Danger = msgspec.field(default_factory=Danger)
+    danger: GroundTruthThresholds = msgspec.field(default_factory=GroundTruthThresholds)
     second_camera: Pose | None = None
     scenario: Annotated[str, Meta(max_length=200)] = ""  #: the one shown; empty: the first
     #: Named configurations that are shown beside the bench's decision.
@@ -147,7 +147,7 @@ class Bench(Section, frozen=True):
     ] = ()
 
 
-def in_force(loaded: LoadedConfig) -> Bench:
+def settings_in_force(loaded: LoadedConfig) -> BenchSettings:
     """The bench that changes nothing: the configuration's decision and camera, where the paper's
     simulation camera stands."""
     camera = ground_camera(loaded)
@@ -155,7 +155,7 @@ def in_force(loaded: LoadedConfig) -> Bench:
     if fov_deg is None and loaded.calibration is not None:
         fov_deg = loaded.calibration.fov_deg
     pose = SIMULATION_POSE
-    return Bench(
+    return BenchSettings(
         camera=Mount(
             x_m=pose.x_m,
             y_m=pose.y_m,
@@ -168,12 +168,12 @@ def in_force(loaded: LoadedConfig) -> Bench:
     )
 
 
-def mounted(loaded: LoadedConfig, mount: Mount) -> GroundCamera:
+def camera_with_mount(loaded: LoadedConfig, mount: Mount) -> GroundCamera:
     """The configuration's camera, hung as `mount` says: as `--set camera.height_m=...` makes it."""
-    return ground_camera(with_mount(loaded, mount))
+    return ground_camera(config_with_mount(loaded, mount))
 
 
-def with_mount(loaded: LoadedConfig, mount: Mount) -> LoadedConfig:
+def config_with_mount(loaded: LoadedConfig, mount: Mount) -> LoadedConfig:
     """The configuration with this height, pitch and field of view."""
     changed = {
         key: value
@@ -182,7 +182,7 @@ def with_mount(loaded: LoadedConfig, mount: Mount) -> LoadedConfig:
             ("pitch_deg", mount.pitch_deg),
             ("fov_deg", mount.fov_deg),
         )
-        if value != getattr(in_force(loaded).camera, key)
+        if value != getattr(settings_in_force(loaded).camera, key)
     }
     if not changed:
         return loaded
@@ -191,7 +191,7 @@ def with_mount(loaded: LoadedConfig, mount: Mount) -> LoadedConfig:
     return replace(loaded, config=config)
 
 
-def check_bench(bench: Bench) -> Bench:
+def check_settings(bench: BenchSettings) -> BenchSettings:
     """What single ranges cannot say; BikepedError names the key and the mend."""
     decision = bench.decision
     if decision.d_min_m > decision.d_max_m:
@@ -205,15 +205,15 @@ def check_bench(bench: Bench) -> Bench:
     return bench
 
 
-def own_scenarios(
-    bench: Bench, read: Callable[[str, str], Scenario] | None = None
+def custom_scenarios(
+    bench: BenchSettings, read: Callable[[str, str], Scenario] | None = None
 ) -> list[Scenario]:
     """The scenarios that came with the bench, checked as files are, and small enough for a page.
 
-    `read` stands in for `parse_own`, e.g. to keep what was read.
+    `read` stands in for `parse_custom_scenario`, e.g. to keep what was read.
     """
     found = [
-        (read or parse_own)(text, f"scenario {number}")
+        (read or parse_custom_scenario)(text, f"scenario {number}")
         for number, text in enumerate(bench.scripts, 1)
     ]
     names = [s.name for s in found]
@@ -223,7 +223,7 @@ def own_scenarios(
     return found
 
 
-def parse_own(text: str, source: str) -> Scenario:
+def parse_custom_scenario(text: str, source: str) -> Scenario:
     """A scenario from a page; ScenarioError when it is wrong, or too large to answer at once."""
     scenario = parse_scenario(text, source)
     if len(scenario.agents) > MAX_AGENTS:
@@ -244,7 +244,7 @@ def parse_own(text: str, source: str) -> Scenario:
 # --- as a link
 
 
-def link_of(bench: Bench, base: Bench) -> str:
+def settings_to_link(bench: BenchSettings, base: BenchSettings) -> str:
     """What differs from `base` as `key=value&...`, readable: `decision.d_max_m=15`."""
     return "&".join(
         f"{key}={quote(_text(value), safe='')}" for key, value in _differences(bench, base)
@@ -259,7 +259,7 @@ def _text(value: Any) -> str:
 VIEW = ("scenario", "beside")
 
 
-def _differences(bench: Bench, base: Bench) -> list[tuple[str, Any]]:
+def _differences(bench: BenchSettings, base: BenchSettings) -> list[tuple[str, Any]]:
     now, before = msgspec.to_builtins(bench), msgspec.to_builtins(base)
     found: list[tuple[str, Any]] = []
     for key, value in now.items():
@@ -270,7 +270,7 @@ def _differences(bench: Bench, base: Bench) -> list[tuple[str, Any]]:
     return found
 
 
-def parse_link(link: str, base: Bench) -> Bench:
+def settings_from_link(link: str, base: BenchSettings) -> BenchSettings:
     """The bench of a link: a whole address or only what follows its `#`.
 
     BikepedError names the key and the mend.
@@ -308,13 +308,18 @@ def _no_number(name: str) -> Any:
 # --- as a file
 
 
-def file_of(bench: Bench, base: Bench, facts: dict[str, Any]) -> str:
+def settings_to_file(bench: BenchSettings, base: BenchSettings, facts: dict[str, Any]) -> str:
     """A challenge as a file: all settings, and what they were measured against."""
-    data = {"format": 1, **facts, "link": link_of(bench, base), "bench": msgspec.to_builtins(bench)}
+    data = {
+        "format": 1,
+        **facts,
+        "link": settings_to_link(bench, base),
+        "bench": msgspec.to_builtins(bench),
+    }
     return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
-def parse_file(text: str | bytes, source: str) -> Bench:
+def settings_from_file(text: str | bytes, source: str) -> BenchSettings:
     """The bench of a challenge's file; BikepedError names the file, the key and the mend."""
     try:
         data = json.loads(text, parse_constant=_no_number)
@@ -325,8 +330,8 @@ def parse_file(text: str | bytes, source: str) -> Bench:
     return _bench(data["bench"], source)
 
 
-def _bench(data: Any, source: str) -> Bench:
+def _bench(data: Any, source: str) -> BenchSettings:
     try:
-        return check_bench(msgspec.convert(data, Bench, strict=True))
+        return check_settings(msgspec.convert(data, BenchSettings, strict=True))
     except msgspec.ValidationError as error:
         raise BikepedError(f"{source}: {error}; correct it there") from error

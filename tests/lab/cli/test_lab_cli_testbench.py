@@ -15,11 +15,11 @@ from aiohttp.test_utils import TestClient, TestServer
 from bikeped.cli.main import main
 from bikeped.config import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
-from bikeped.lab.testbench.contest import Origin
+from bikeped.lab.testbench.contest import InvocationOptions
 from bikeped.lab.testbench.pages import add_testbench
-from bikeped.lab.testbench.settings import in_force
-from bikeped.web.security import Access
-from bikeped.web.server import make_pages
+from bikeped.lab.testbench.settings import settings_in_force
+from bikeped.web.security import AccessPolicy
+from bikeped.web.server import make_application
 
 OWN = """
 name: My crossing
@@ -43,10 +43,11 @@ def page_says(folder, **changes):
 
     async def ask():
         loaded, scenarios = load_config(), load_scenarios(folder)
-        bench = msgspec.structs.replace(in_force(loaded), **changes)
-        access = Access(frozenset({"127.0.0.1"}))
-        app = make_pages(
-            access, lambda app: add_testbench(app, loaded, scenarios, Origin(None, folder))
+        bench = msgspec.structs.replace(settings_in_force(loaded), **changes)
+        access = AccessPolicy(frozenset({"127.0.0.1"}))
+        app = make_application(
+            access,
+            lambda app: add_testbench(app, loaded, scenarios, InvocationOptions(None, folder)),
         )
         async with TestClient(TestServer(app)) as client:
             asked = {"bench": msgspec.to_builtins(bench)}
@@ -68,7 +69,7 @@ def figures(data):
 
 
 def base():
-    return in_force(load_config())
+    return settings_in_force(load_config())
 
 
 def cases():

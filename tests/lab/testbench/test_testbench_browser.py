@@ -13,7 +13,7 @@ from web_fakes import PHONE
 from bikeped.cli.main import main
 from bikeped.lab.scenarios.scenario import load_scenario, parse_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.lab.testbench.export import make_report
+from bikeped.lab.testbench.export import render_report
 
 
 @pytest.fixture
@@ -286,7 +286,7 @@ def test_the_report_opens_from_the_disk(open_page, assert_accessible, tmp_path):
     named = parse_scenario(OWN.replace("My crossing", json.dumps(MARKUP + "</script>")), "own")
     few = [s for s in SCENARIOS if s.name in ("Bike Approaches Ped", "Bikes Only", "Cyclist Abort")]
     file = tmp_path / "report.html"
-    file.write_text(make_report(LOADED, [*few, named], "bikeped testbench export"), "utf-8")
+    file.write_text(render_report(LOADED, [*few, named], "bikeped testbench export"), "utf-8")
     page = open_page(file.as_uri(), offline=True)
     expect(page.locator("#headline")).to_have_text(re.compile("^The light is red"))
     expect(page.locator("#verdict-section")).to_contain_text("Mean warning budget")
@@ -307,7 +307,7 @@ def test_the_report_opens_from_the_disk(open_page, assert_accessible, tmp_path):
 def test_the_report_shows_the_numbers_of_the_command(open_page, tmp_path, capsys):
     file = tmp_path / "report.html"
     few = [s for s in SCENARIOS if s.name in ("Swerving Cyclist", "E-Scooter")]
-    file.write_text(make_report(LOADED, few, "again"), "utf-8")
+    file.write_text(render_report(LOADED, few, "again"), "utf-8")
     page = open_page(file.as_uri(), viewport=PHONE)
     page.select_option("#scenario", "Swerving Cyclist")
     suite = Suite.load(few, LOADED)

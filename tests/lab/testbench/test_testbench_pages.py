@@ -16,14 +16,14 @@ from bikeped.lab.experiments.montecarlo import Plan, plan_trials, sorted_suite, 
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.lab.testbench.playback import TESTS, coverage, playback
-from bikeped.lab.testbench.run import Workbench, trial_summaries
+from bikeped.lab.testbench.run import BenchRunner, trial_summaries
 from bikeped.lab.testbench.settings import Pose
 from bikeped.types import State
 
 
 @pytest.fixture(scope="module")
 def work():
-    return Workbench(LOADED, SCENARIOS)
+    return BenchRunner(LOADED, SCENARIOS)
 
 
 @pytest.fixture(scope="module")
@@ -214,8 +214,8 @@ def test_what_was_kept_is_not_mistaken_for_something_else(work):
         tracks = hashlib.sha256(suite.run.rows.xy_m.tobytes()).hexdigest()
         return tracks, suite.truths[0].danger.sum(), repr(suite.measure(one.decision).as_dict())
 
-    fresh = [figures(Workbench(LOADED, few), one) for one in asked]
-    warm = Workbench(LOADED, few)
+    fresh = [figures(BenchRunner(LOADED, few), one) for one in asked]
+    warm = BenchRunner(LOADED, few)
     assert [figures(warm, one) for one in asked] == fresh
     assert [figures(warm, one) for one in reversed(asked)] == fresh[::-1]
     assert len(set(fresh)) == len(asked)

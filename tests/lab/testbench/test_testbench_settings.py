@@ -16,20 +16,20 @@ from testbench_fakes import BASE, MARKUP, OWN, bench, pages
 
 from bikeped.config import DecisionConfig
 from bikeped.errors import BikepedError, ScenarioError
-from bikeped.lab.testbench.pages import Desk, ranges
+from bikeped.lab.testbench.pages import JobQueue, ranges
 from bikeped.lab.testbench.settings import (
-    Bench,
-    Danger,
+    BenchSettings,
     Delay,
+    GroundTruthThresholds,
     Mount,
     Perception,
     Pose,
-    file_of,
-    link_of,
-    own_scenarios,
-    parse_file,
-    parse_link,
-    parse_own,
+    custom_scenarios,
+    parse_custom_scenario,
+    settings_from_file,
+    settings_from_link,
+    settings_to_file,
+    settings_to_link,
 )
 
 
@@ -39,7 +39,7 @@ def number(low, high):
 
 poses = {"x_m": number(-100, 100), "y_m": number(-100, 100), "heading_deg": number(-360, 360)}
 benches = st.builds(
-    Bench,
+    BenchSettings,
     camera=st.builds(
         Mount, height_m=number(1, 15), pitch_deg=number(-90, 30), fov_deg=number(30, 240), **poses
     ),
@@ -61,7 +61,7 @@ benches = st.builds(
     ),
     delay=st.builds(Delay, delay_ms=number(0, 1000), order=st.sampled_from([0, 1, 2])),
     danger=st.builds(
-        Danger,
+        GroundTruthThresholds,
         cpa_radius_m=number(0.1, 25),
         ttc_bound_s=st.none() | number(0.1, 60),
         braking=st.sampled_from([None, "bicycle", "ebike", "aashto"]),
@@ -76,23 +76,25 @@ benches = st.builds(
 @settings(max_examples=60, deadline=None)
 @given(benches)
 def test_a_bench_travels_as_link_and_file_without_loss(one):
-    link = link_of(one, BASE)
-    assert parse_link(link, BASE) == one
-    assert parse_link(f"http://127.0.0.1:8090/testbench#{link}", BASE) == one
-    assert parse_file(file_of(one, BASE, {"version": "1"}), "challenge.json") == one
+    link = settings_to_link(one, BASE)
+    assert settings_from_link(link, BASE) == one
+    assert settings_from_link(f"http://127.0.0.1:8090/testbench#{link}", BASE) == one
+    assert (
+        settings_from_file(settings_to_file(one, BASE, {"version": "1"}), "challenge.json") == one
+    )
 
 
 def test_nothing_changed_is_an_empty_link():
-    assert link_of(BASE, BASE) == ""
-    assert parse_link("", BASE) == BASE
-    assert link_of(bench(decision={"d_max_m": 15.0}), BASE) == "decision.d_max_m=15.0"
+    assert settings_to_link(BASE, BASE) == ""
+    assert settings_from_link("", BASE) == BASE
+    assert settings_to_link(bench(decision={"d_max_m": 15.0}), BASE) == "decision.d_max_m=15.0"
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.text(st.sampled_from('decision.mx_=&%#1"{}[]\\ecamrNa∞'), max_size=60))
 def test_any_text_is_a_bench_or_an_error_in_words(text):
     with contextlib.suppress(BikepedError):  # and nothing else
-        assert isinstance(parse_link(text, BASE), Bench)
+        assert isinstance(settings_from_link(text, BASE), BenchSettings)
 
 
 @pytest.mark.parametrize(
@@ -114,13 +116,13 @@ def test_any_text_is_a_bench_or_an_error_in_words(text):
 )
 def test_a_bad_link_names_what_is_wrong(link, says):
     with pytest.raises(BikepedError, match=says):
-        parse_link(link, BASE)
+        settings_from_link(link, BASE)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2, "bench": {}}', "{" * 100_000])
 def test_a_file_that_is_no_challenge_is_refused(text):
     with pytest.raises(BikepedError, match=r"some\.json"):
-        parse_file(text, "some.json")
+        settings_from_file(text, "some.json")
 
 
 @pytest.mark.parametrize(
@@ -142,12 +144,12 @@ def test_a_file_that_is_no_challenge_is_refused(text):
 )
 def test_a_bad_scenario_is_refused_in_words(text, says):
     with pytest.raises(ScenarioError, match=says):
-        parse_own(text, "scenario")
+        parse_custom_scenario(text, "scenario")
 
 
 def test_two_scenarios_of_one_name_are_refused():
     with pytest.raises(ScenarioError, match="twice"):
-        own_scenarios(msgspec.structs.replace(BASE, scripts=(OWN, OWN)))
+        custom_scenarios(msgspec.structs.replace(BASE, scripts=(OWN, OWN)))
 
 
 def test_the_page_s_ranges_are_those_that_are_checked():
@@ -161,7 +163,7 @@ def test_the_page_s_ranges_are_those_that_are_checked():
     for key, one in told.items():
         if one["high"] is not None:
             with pytest.raises(BikepedError):
-                parse_link(f"{key}={one['high'] + 1}", BASE)
+                settings_from_link(f"{key}={one['high'] + 1}", BASE)
 
 
 async def test_requests_that_are_wrong_are_refused_and_touch_no_file():
@@ -205,7 +207,7 @@ async def test_too_much_work_is_refused():
 
 
 async def test_of_a_page_s_waiting_requests_only_the_newest_is_answered():
-    desk, gate, order = Desk(), threading.Event(), []
+    desk, gate, order = JobQueue(), threading.Event(), []
 
     def job(name):
         def run():
@@ -231,7 +233,7 @@ async def test_of_a_page_s_waiting_requests_only_the_newest_is_answered():
 
 
 async def test_a_full_desk_turns_away_and_a_left_one_goes_on():
-    desk, gate = Desk(most_waiting=2), threading.Event()
+    desk, gate = JobQueue(most_waiting=2), threading.Event()
     running = asyncio.ensure_future(desk.ask("0", lambda: gate.wait(30)))
     await asyncio.sleep(0)
     waiting = [asyncio.ensure_future(desk.ask(str(i), lambda i=i: i)) for i in (1, 2)]
@@ -247,7 +249,7 @@ async def test_a_full_desk_turns_away_and_a_left_one_goes_on():
 
 
 async def test_an_error_in_a_job_does_not_block_the_desk():
-    desk = Desk()
+    desk = JobQueue()
     with pytest.raises(ZeroDivisionError):
         await desk.ask("me", lambda: 1 // 0)
     assert await desk.ask("me", lambda: 7) == 7

@@ -12,12 +12,12 @@ from web_fakes import OPEN
 from bikeped.config import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.testbench.pages import add_testbench
-from bikeped.lab.testbench.settings import Bench, in_force
-from bikeped.web.server import make_pages
+from bikeped.lab.testbench.settings import BenchSettings, settings_in_force
+from bikeped.web.server import make_application
 
 LOADED = load_config()
 SCENARIOS = load_scenarios(bundled_folder())
-BASE = in_force(LOADED)
+BASE = settings_in_force(LOADED)
 MARKUP = "<img src=x onerror=document.title='hacked'><b>&amp;"
 OWN = """
 name: My crossing
@@ -29,10 +29,12 @@ agents:
 
 def pages():
     """The application."""
-    return make_pages(OPEN, lambda app: add_testbench(app, LOADED, SCENARIOS))
+    return make_application(OPEN, lambda app: add_testbench(app, LOADED, SCENARIOS))
 
 
-def bench(scenario: str = "", base: Bench = BASE, **sections: dict[str, Any]) -> Bench:
+def bench(
+    scenario: str = "", base: BenchSettings = BASE, **sections: dict[str, Any]
+) -> BenchSettings:
     """`base` with changed keys: `bench(decision={"d_max_m": 9.0})`."""
     changes: dict[str, Any] = {
         name: msgspec.structs.replace(getattr(base, name), **keys)
