@@ -76,7 +76,15 @@ def health(**changes: Any) -> HealthMessage:
         "light": ComponentStatus(ok=True, detail="simulated"),
         "faults": (),
         "counters": Counters(
-            frames=100, dropped=2, undecodable=1, alerts=1, mqtt_dropped=0, audit_dropped=0
+            received=112,
+            frames=100,
+            dropped=2,
+            undecodable=1,
+            failed=4,
+            out_of_order=3,
+            alerts=1,
+            mqtt_dropped=0,
+            audit_dropped=0,
         ),
     }
     return health_message(**{**values, **changes})

@@ -51,8 +51,9 @@ def health_line(message: HealthMessage) -> str:
     counters = message.counters
     parts = [
         (
-            f"{message.state}, {message.fps:.1f} frames/s, {counters.frames} judged, "
-            f"{counters.dropped} dropped, {counters.undecodable} undecodable"
+            f"{message.state}, {message.fps:.1f} frames/s, {counters.frames} processed, "
+            f"{counters.dropped} dropped, {counters.undecodable} undecodable, "
+            f"{counters.failed} failed, {counters.out_of_order} out of order"
         ),
         "latency p50/p95/p99 ms: "
         + latency_line(

@@ -62,7 +62,6 @@ class Telemetry:
         self._recent: deque[float] = deque(maxlen=240)  # when frames were judged
         self._last: Outcome | None = None
         self._signal: Signal | None = None
-        self._counted: dict[str, int] = {}
 
     async def frame(self, outcome: Outcome) -> None:
         self._last = outcome
@@ -70,7 +69,7 @@ class Telemetry:
         self._recent.append(now_s)
         self.times.add(outcome.latency_ms)
         if self._metrics is not None:
-            self._metrics.frame(
+            self._metrics.count_frame(
                 detections=outcome.detections,
                 tracks=outcome.judgement.tracks,
                 latency_ms=outcome.latency_ms,
@@ -91,7 +90,7 @@ class Telemetry:
     def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
         self._signal = signal
         if self._metrics is not None:
-            self._metrics.shown(_shown(signal))
+            self._metrics.set_state(_shown(signal))
         shown = (signal.name, signal.faults if signal.name == "FAULT" else ())
         before, self._shown = self._shown, shown
         if shown == before:
@@ -122,7 +121,6 @@ class Telemetry:
         faults = (*(signal.faults if signal else ()), *faults)
         camera = [fault for fault in faults if fault.startswith(("camera", "geometry"))]
         detector = [fault for fault in faults if fault.startswith("detector")]
-        status = self._mqtt.status if self._mqtt is not None else None
         age_s = loop.frame_age_s()
         age_ms = None if age_s is None else age_s * 1e3
         if age_ms is None and self._last is not None:
@@ -140,14 +138,21 @@ class Telemetry:
             detector=ComponentStatus(ok=not detector, detail="; ".join(detector) or "answers"),
             light=light,
             faults=faults,
-            counters=Counters(
-                frames=loop.counts.frames,
-                dropped=loop.dropped(),
-                undecodable=loop.counts.undecodable,
-                alerts=self.alerts,
-                mqtt_dropped=status.dropped if status else 0,
-                audit_dropped=self._audit.dropped if self._audit else 0,
-            ),
+            counters=self._counters(loop),
+        )
+
+    def _counters(self, loop: Loop) -> Counters:
+        counts = loop.counts
+        return Counters(
+            received=counts.received,
+            frames=counts.frames,
+            dropped=loop.dropped(),
+            undecodable=counts.undecodable,
+            failed=counts.failed,
+            out_of_order=counts.out_of_order,
+            alerts=self.alerts,
+            mqtt_dropped=self._mqtt.status.dropped if self._mqtt else 0,
+            audit_dropped=self._audit.dropped if self._audit else 0,
         )
 
     def publish_health(self, message: HealthMessage) -> None:
@@ -158,29 +163,15 @@ class Telemetry:
 
     def measure(self, loop: Loop, light_errors: int = 0) -> None:
         """Brings the metrics that no single frame tells up to date."""
-        metrics = self._metrics
-        if metrics is None:
-            return
-        status = self._mqtt.status if self._mqtt is not None else None
-        metrics.rates(
-            fps=self.fps(),
-            capture_age_s=loop.frame_age_s(),
-            faults=len(self._signal.faults) if self._signal else 0,
-        )
-        metrics.queues(
-            mqtt_connected=bool(status and status.connected),
-            mqtt_dropped=status.dropped if status else 0,
-            audit_dropped=self._audit.dropped if self._audit else 0,
-        )
-        metrics.dropped("newer", self._since("dropped", loop.dropped()))
-        metrics.undecodable(self._since("undecodable", loop.counts.undecodable))
-        for _ in range(self._since("light", light_errors)):
-            metrics.light_fault()
-
-    def _since(self, name: str, total: int) -> int:
-        """How much a total has grown since it was last asked for."""
-        before, self._counted[name] = self._counted.get(name, 0), total
-        return max(0, total - before)
+        if self._metrics is not None:
+            self._metrics.update(
+                fps=self.fps(),
+                capture_age_s=loop.frame_age_s(),
+                faults=len(self._signal.faults) if self._signal else 0,
+                mqtt_connected=self._mqtt is not None and self._mqtt.status.connected,
+                light_errors=light_errors,
+                counters=self._counters(loop),
+            )
 
     def _due(self, now_s: float) -> float:
         """The next due time on a fixed grid, so that 0.1 s means ten a second on average."""

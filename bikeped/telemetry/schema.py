@@ -107,9 +107,14 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
 class Counters(msgspec.Struct, frozen=True, kw_only=True):
     """Totals since the process started."""
 
-    frames: Count
+    received: Annotated[Count, Meta(description="frames received from the camera")]
+    frames: Annotated[Count, Meta(description="frames processed through to a decision")]
     dropped: Annotated[Count, Meta(description="frames replaced by a newer one before inference")]
-    undecodable: Annotated[Count, Meta(description="frames whose picture could not be decoded")]
+    undecodable: Annotated[Count, Meta(description="frames that could not be decoded")]
+    failed: Annotated[Count, Meta(description="frames for which the detector raised an error")]
+    out_of_order: Annotated[
+        Count, Meta(description="frames skipped because their capture time did not increase")
+    ]
     alerts: Annotated[Count, Meta(description="changes into ALERT")]
     mqtt_dropped: Annotated[Count, Meta(description="messages dropped before reaching the broker")]
     audit_dropped: Annotated[Count, Meta(description="event lines not written to the audit log")]

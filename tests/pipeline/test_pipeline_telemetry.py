@@ -10,6 +10,7 @@ import pytest
 from pipeline_fakes import Clock, Rig, seen, small
 from prometheus_client import generate_latest
 
+from bikeped.errors import DetectorError
 from bikeped.feedback import SignalLogic
 from bikeped.pipeline.health_report import health_line, report_health
 from bikeped.pipeline.signal_dispatcher import Announcer
@@ -104,6 +105,9 @@ async def test_the_state_message_of_an_alert_has_that_frames_pair():
         assert alert["state"] == line.state == "ALERT"
         assert alert["pair"] == list(line.pair)
         assert rig.telemetry.alerts == 1
+        for _ in range(2):
+            rig.telemetry.measure(rig.loop)
+        assert rig.metrics.registry.get_sample_value("bikeped_alerts_total") == 1
 
 
 async def test_tracks_come_at_the_interval_with_the_time_of_capture():
@@ -182,6 +186,33 @@ async def test_metrics_count_what_no_single_frame_tells():
         assert "bikeped_mqtt_dropped_total 3.0" in text
         assert "bikeped_frames_total 6.0" in text
         assert 'bikeped_state{bikeped_state="IDLE"} 1.0' in text
+
+
+async def test_every_lost_frame_is_in_health_metrics_and_log_line():
+    async with TelemetryRig() as rig:
+        await rig.well()
+        await rig.frames(2, jpeg=b"junk")
+        rig.eye.error = DetectorError("out of memory")
+        await rig.frames(3)
+        rig.eye.error = None
+        rig.feed.put(rig.clock.now_s - 50)
+        await rig.recorder.until(lambda: rig.loop.counts.out_of_order == 1)
+        message = rig.telemetry.health(rig.loop, ComponentStatus(ok=True, detail="simulated"))
+        counters = valid("health", encode(message))["counters"]
+        assert {key: counters[key] for key in ("received", "frames", "undecodable")} == {
+            "received": 12,
+            "frames": 6,
+            "undecodable": 2,
+        }
+        assert (counters["failed"], counters["out_of_order"]) == (3, 1)
+        assert "6 processed, 0 dropped, 2 undecodable, 3 failed, 1 out of order" in health_line(
+            message
+        )
+        rig.telemetry.measure(rig.loop)
+        text = generate_latest(rig.metrics.registry).decode()
+        assert "bikeped_frames_received_total 12.0" in text
+        assert "bikeped_frames_failed_total 3.0" in text
+        assert "bikeped_frames_out_of_order_total 1.0" in text
 
 
 async def test_a_failing_health_report_costs_a_message_and_no_more(caplog):

@@ -73,12 +73,15 @@ def test_templates_name_keys_that_the_messages_have():
         assert entity["value_template"].count("{{") == entity["value_template"].count("}}") == 1
 
 
-def test_health_values_expire_later_than_they_are_sent():
-    for interval_s in (0.1, 10.0, 100.0):
-        config = MqttConfig(home_assistant=True, health_interval_s=interval_s)
-        for payload in discovery_messages(config, "1").values():
-            entity = json.loads(payload)
-            if entity["state_topic"].endswith("/health"):
-                assert entity["expire_after"] >= 3 * interval_s
-            else:
-                assert "expire_after" not in entity  # a state may last for hours
+@pytest.mark.parametrize(
+    ("interval_s", "expire_after"), [(0.1, 30), (10.0, 30), (10.5, 32), (11.0, 33), (100.0, 300)]
+)
+def test_health_values_expire_after_three_missed_reports_and_30_s_at_least(
+    interval_s: float, expire_after: int
+):
+    config = MqttConfig(home_assistant=True, health_interval_s=interval_s)
+    found = [json.loads(payload) for payload in discovery_messages(config, "1").values()]
+    on_health = [entity for entity in found if entity["state_topic"].endswith("/health")]
+    assert [entity.get("expire_after") for entity in on_health] == [expire_after] * 4
+    # A state may last for hours.
+    assert all("expire_after" not in entity for entity in found if entity not in on_health)

@@ -16,6 +16,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
 from bikeped.config import WebConfig, is_loopback
+from bikeped.telemetry.builders import Counters
 from bikeped.telemetry.http_server import Health, HttpServer, add_monitoring, host_name, port_error
 from bikeped.telemetry.metrics import Metrics
 
@@ -50,7 +51,15 @@ async def get(url: str, **headers: str) -> tuple[int, str, str]:
 
 async def test_metrics_are_prometheus_text(serve):
     metrics = Metrics()
-    metrics.undecodable(3)
+    counters = Counters(**{**dict.fromkeys(Counters.__struct_fields__, 0), "undecodable": 3})
+    metrics.update(
+        fps=0.0,
+        capture_age_s=None,
+        faults=0,
+        mqtt_connected=False,
+        light_errors=0,
+        counters=counters,
+    )
     base = await serve(make_app(metrics.registry, dict))
     status, content_type, body = await get(f"{base}/metrics")
     assert status == 200

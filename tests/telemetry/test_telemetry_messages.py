@@ -53,7 +53,17 @@ DETECTIONS = Detections(
     np.array([0.1], np.float32),
     np.array([[1.04, 2.06, 3.0, 4.0]], np.float32),
 )
-COUNTERS = m.Counters(frames=9, dropped=1, undecodable=0, alerts=2, mqtt_dropped=0, audit_dropped=0)
+COUNTERS = m.Counters(
+    received=13,
+    frames=9,
+    dropped=1,
+    undecodable=0,
+    failed=2,
+    out_of_order=1,
+    alerts=2,
+    mqtt_dropped=0,
+    audit_dropped=0,
+)
 
 
 def tracks_message(**changes) -> m.TracksMessage:

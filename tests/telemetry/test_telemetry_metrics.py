@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+import pytest
 from prometheus_client import REGISTRY
 
+from bikeped.telemetry.builders import Counters
 from bikeped.telemetry.metrics import Metrics
 from bikeped.types import Detections, Tracks
 
@@ -31,9 +34,9 @@ def value(metrics: Metrics, name: str, **labels: str) -> float | None:
 def test_frames_detections_tracks_and_latency():
     metrics = Metrics()
     times = {"total": 25.0, "pre": math.nan}
-    metrics.frame(detections=DETECTIONS, tracks=TRACKS, latency_ms=times)
-    metrics.frame(detections=Detections.empty(), tracks=Tracks.empty(1.0), latency_ms={})
-    metrics.frame(detections=DETECTIONS, tracks=TRACKS, latency_ms={"total": 5.0})
+    metrics.count_frame(detections=DETECTIONS, tracks=TRACKS, latency_ms=times)
+    metrics.count_frame(detections=Detections.empty(), tracks=Tracks.empty(1.0), latency_ms={})
+    metrics.count_frame(detections=DETECTIONS, tracks=TRACKS, latency_ms={"total": 5.0})
     assert value(metrics, "frames_total") == 3
     assert value(metrics, "detections_total", kind="cyclist") == 4
     assert value(metrics, "detections_total", kind="pedestrian") == 2
@@ -47,47 +50,67 @@ def test_frames_detections_tracks_and_latency():
     assert value(metrics, "stage_latency_seconds_count", stage="pre") == 0
 
 
-def test_every_change_into_alert_counts_once():
+def counters(**totals: int) -> Counters:
+    return Counters(**{**dict.fromkeys(Counters.__struct_fields__, 0), **totals})
+
+
+def update(metrics: Metrics, **changes: Any) -> None:
+    values = {"fps": 0.0, "capture_age_s": None, "faults": 0, "mqtt_connected": False}
+    metrics.update(**{**values, "light_errors": 0, "counters": counters(), **changes})
+
+
+def test_the_state_is_the_newest_one():
     metrics = Metrics()
     for state in ("SAFE", "ALERT", "ALERT", "WARNING", "ALERT", "FAULT"):
-        metrics.shown(state)
-    assert value(metrics, "alerts_total") == 2
+        metrics.set_state(state)
     assert value(metrics, "state", bikeped_state="FAULT") == 1
     assert value(metrics, "state", bikeped_state="ALERT") == 0
 
 
-def test_drops_faults_and_rates():
+def test_gauges():
     metrics = Metrics()
-    assert value(metrics, "frames_dropped_total", reason="newer") == 0  # visible before the first
-    metrics.dropped("newer")
-    metrics.dropped("newer", 2)
-    metrics.undecodable()
-    metrics.light_fault()
-    metrics.rates(fps=29.5, capture_age_s=None, faults=2)
-    assert value(metrics, "frames_dropped_total", reason="newer") == 3
-    assert value(metrics, "frames_undecodable_total") == 1
-    assert value(metrics, "light_faults_total") == 1
+    update(metrics, fps=29.5, faults=2, mqtt_connected=True)
     assert value(metrics, "fps") == 29.5
     assert value(metrics, "faults") == 2
-    assert math.isnan(value(metrics, "capture_age_seconds") or 0)
-    metrics.rates(fps=29.5, capture_age_s=0.04, faults=0)
-    assert value(metrics, "capture_age_seconds") == 0.04
-
-
-def test_totals_counted_elsewhere_are_taken_over_and_never_go_back():
-    metrics = Metrics()
-    for total in (3, 3, 10, 4, 12):
-        metrics.queues(mqtt_connected=True, mqtt_dropped=total, audit_dropped=0)
-    assert value(metrics, "mqtt_dropped_total") == 12
-    assert value(metrics, "audit_dropped_total") == 0
     assert value(metrics, "mqtt_connected") == 1
-    metrics.queues(mqtt_connected=False, mqtt_dropped=12, audit_dropped=1)
+    assert math.isnan(value(metrics, "capture_age_seconds") or 0)
+    update(metrics, fps=29.5, capture_age_s=0.04)
+    assert value(metrics, "capture_age_seconds") == 0.04
+    assert value(metrics, "faults") == 0
     assert value(metrics, "mqtt_connected") == 0
-    assert value(metrics, "audit_dropped_total") == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "name"),
+    [
+        ("received", "frames_received_total"),
+        ("dropped", "frames_dropped_total"),
+        ("undecodable", "frames_undecodable_total"),
+        ("failed", "frames_failed_total"),
+        ("out_of_order", "frames_out_of_order_total"),
+        ("alerts", "alerts_total"),
+        ("mqtt_dropped", "mqtt_dropped_total"),
+        ("audit_dropped", "audit_dropped_total"),
+        ("light_errors", "light_faults_total"),
+    ],
+)
+def test_totals_counted_elsewhere_are_taken_over_and_never_go_back(field: str, name: str):
+    metrics = Metrics()
+    labels = {"reason": "newer"} if field == "dropped" else {}
+    assert value(metrics, name, **labels) == 0  # visible before the first
+    for total in (3, 3, 10, 4, 12):
+        if field == "light_errors":
+            update(metrics, light_errors=total)
+        else:
+            update(metrics, counters=counters(**{field: total}))
+    assert value(metrics, name, **labels) == 12
+    others = [s for m in metrics.registry.collect() for s in m.samples if s.name.endswith("_total")]
+    assert sum(sample.value for sample in others) == 12  # no other counter has moved
 
 
 def test_two_services_in_one_process_do_not_meet():
     first, second = Metrics(), Metrics()
-    first.undecodable()
+    update(first, counters=counters(undecodable=1))
+    assert value(first, "frames_undecodable_total") == 1
     assert value(second, "frames_undecodable_total") == 0
     assert REGISTRY.get_sample_value("bikeped_frames_undecodable_total") is None

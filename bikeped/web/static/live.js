@@ -305,7 +305,7 @@ function showStatus({ health, mqtt }) {
   faults.hidden = health.faults.length === 0;
   faults.replaceChildren(...health.faults.map((text) => el("li", {}, text)));
   const part = ({ ok, detail }) => [detail, ok ? "ok-mark" : "bad-mark"];
-  const { frames, dropped, undecodable, alerts, mqtt_dropped, audit_dropped } = health.counters;
+  const lost = health.counters;
   const rows = [
     ["Camera", ...part(health.camera)],
     ["Detector", ...part(health.detector)],
@@ -313,8 +313,8 @@ function showStatus({ health, mqtt }) {
     ["MQTT", ...brokerWords(mqtt)],
     ["Rate", `${fixed(health.fps, 1)} frames/s`],
     ["Newest frame", health.camera.capture_age_ms === null ? "none yet" : `${millis(health.camera.capture_age_ms)} old`],
-    ["Since start", `${duration(health.uptime_s)}, ${count(frames, "frame")}, ${count(alerts, "alert")}`],
-    ["Lost", `${dropped} replaced, ${undecodable} undecodable, ${mqtt_dropped} messages, ${audit_dropped} log lines`],
+    ["Since start", `${duration(health.uptime_s)}, ${count(lost.frames, "frame")}, ${count(lost.alerts, "alert")}`],
+    ["Lost", `${lost.dropped} replaced, ${lost.undecodable} undecodable, ${lost.failed} failed, ${lost.out_of_order} out of order, ${lost.mqtt_dropped} messages, ${lost.audit_dropped} log lines`],
     ["Watching", hello?.source ?? "–"],
     ["Model", hello?.detector ?? "–"],
     ["Rule", hello ? `${hello.rule}, configuration ${hello.config_hash.slice(0, 12)}` : "–"],
