@@ -32,7 +32,7 @@ def run(figures: Figures) -> None:
     def obvious_part() -> None:
         """One configuration with localisation error, frame by frame: 1/14 of the comparison."""
         suite = Suite.load(scenarios, loaded)
-        for scene in suite.scenes():
+        for scene in suite.detection_sequences():
             tracker = BatchTracker(SIMULATION_TRACKER)
             decider = Decider(rule_settings(CONFIGURATIONS["selected"]))
             for i in range(len(scene.xy_m)):

@@ -182,7 +182,7 @@ def contest(
     """
     from bikeped.lab.governance import contest as contesting
     from bikeped.lab.scenarios.scenario import load_scenario
-    from bikeped.lab.simulation.suite import DEFAULT_TRUTH
+    from bikeped.lab.simulation.suite import DEFAULT_GROUND_TRUTH
 
     if not (overrides or added or truth or bound):
         raise BikepedError(
@@ -198,7 +198,7 @@ def contest(
     if added:
         after = contesting.with_scenarios(after, [load_scenario(path) for path in added])
     if truth:
-        after = after.with_truth(contesting.parse_truth(DEFAULT_TRUTH, truth))
+        after = after.with_truth(contesting.parse_truth(DEFAULT_GROUND_TRUTH, truth))
     decision = contesting.apply_bounds(other.config.decision, bound)
     found = contesting.contest(before, loaded.config.decision, after, decision)
     command = _command_line(config_path, overrides, scenarios_dir, added, truth, bound)

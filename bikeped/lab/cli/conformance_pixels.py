@@ -92,7 +92,9 @@ def command(
         )
     rungs = ladder(suite, runs, loaded, loaded.config.decision)
     drawing = Drawing(width, height, light, weather, place, seed or 0)
-    result = pixels_result(suite, runs, rungs, sights(runs, suite.seen, loaded), drawing)
+    result = pixels_result(
+        suite, runs, rungs, sights(runs, suite.perception_results, loaded), drawing
+    )
     if figures is not None:
         from bikeped.lab.endtoend.figure import draw_pixels
 

@@ -17,7 +17,7 @@ from bikeped.lab.endtoend.matching import MIN_VISIBLE, match
 from bikeped.lab.endtoend.run import PixelRun
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.simulation.metrics import Metrics, measure
-from bikeped.lab.simulation.perception import Seen
+from bikeped.lab.simulation.perception import PerceptionResult
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.suite import Suite
 from bikeped.pipeline.track_and_decide import Judge
@@ -41,7 +41,7 @@ def ladder(
 ) -> list[Rung]:
     """The rungs from scripted positions to the deployed loop, over all scenarios of `suite`."""
     judge = Judge(loaded, riders_whole=all(run.riders_whole for run in runs))
-    seen = suite.seen
+    seen = suite.perception_results
 
     def points(present: Callable[[PixelRun, int, int], bool]) -> States:
         return np.concatenate(
@@ -73,7 +73,10 @@ def ladder(
 
 
 def _judge_points(
-    judge: Judge, seen: Seen, run: PixelRun, present: Callable[[PixelRun, int, int], bool]
+    judge: Judge,
+    seen: PerceptionResult,
+    run: PixelRun,
+    present: Callable[[PixelRun, int, int], bool],
 ) -> States:
     judge.reset()
     states = []

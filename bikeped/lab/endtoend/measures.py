@@ -11,7 +11,7 @@ import numpy as np
 from bikeped.config import LoadedConfig
 from bikeped.lab.endtoend.matching import MIN_VISIBLE, match
 from bikeped.lab.endtoend.run import PixelRun
-from bikeped.lab.simulation.perception import Seen
+from bikeped.lab.simulation.perception import PerceptionResult
 from bikeped.pipeline.ground_mapper import Viewpoint
 from bikeped.types import Detections, FloatArray, Kind
 
@@ -39,7 +39,9 @@ class Sights:
     model_m: FloatArray
 
 
-def sights(runs: Sequence[PixelRun], seen: Sequence[Seen], loaded: LoadedConfig) -> Sights:
+def sights(
+    runs: Sequence[PixelRun], seen: Sequence[PerceptionResult], loaded: LoadedConfig
+) -> Sights:
     """What there was to see in `runs`, and what became of it."""
     viewpoint = Viewpoint(loaded)
     rows: list[tuple[float, ...]] = []

@@ -13,7 +13,7 @@ from bikeped.lab.endtoend.measures import Sights, localisation_rows, recall_rows
 from bikeped.lab.endtoend.run import PixelRun
 from bikeped.lab.experiments.deterministic import SHOWN_COLUMNS, percent, shown
 from bikeped.lab.result_tables import Cell, Result, Table
-from bikeped.lab.simulation.metrics import Metrics, number
+from bikeped.lab.simulation.metrics import Metrics, finite_or_none
 from bikeped.lab.simulation.perception import error_table
 from bikeped.lab.simulation.suite import Suite
 from bikeped.types import Kind
@@ -46,8 +46,8 @@ def pixels_result(
         "frames": seen.frames,
         "goal": {
             "within": GOAL,
-            "sensitivity_change": number(whole.sensitivity - scripted.sensitivity),
-            "specificity_change": number(whole.specificity - scripted.specificity),
+            "sensitivity_change": finite_or_none(whole.sensitivity - scripted.sensitivity),
+            "specificity_change": finite_or_none(whole.specificity - scripted.specificity),
             "holds": within_goal(rungs),
         },
         "stages": [_stage(rungs, i) for i in range(len(rungs))],

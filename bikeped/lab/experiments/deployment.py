@@ -27,9 +27,9 @@ from bikeped.lab.experiments.deterministic import Progress, percent, quiet
 from bikeped.lab.experiments.montecarlo import Observed, Plan, simulate_views, summaries
 from bikeped.lab.result_tables import Result, Table
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
-from bikeped.lab.simulation.metrics import TruthFrames
-from bikeped.lab.simulation.perception import RecallModel, Seen, see
-from bikeped.lab.simulation.truth import judge_truth
+from bikeped.lab.simulation.metrics import GroundTruthFrames
+from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
+from bikeped.lab.simulation.truth import compute_ground_truth
 from bikeped.types import FloatArray
 
 FOOT_M = 0.3048
@@ -90,13 +90,13 @@ def observe(
     visible_only: bool = False,
 ) -> Observed:
     """What one camera, or several fused, could detect; see the module's text."""
-    seen = [see(scenario, camera, pose) for pose in where]
+    seen = [simulate_perception(scenario, camera, pose) for pose in where]
     return fuse(scenario.name, seen, where, recall, visible_only)
 
 
 def fuse(
     name: str,
-    seen: Sequence[Seen],
+    seen: Sequence[PerceptionResult],
     where: Sequence[CameraPose],
     recall: RecallModel = _SIZE,
     visible_only: bool = False,
@@ -113,7 +113,7 @@ def fuse(
     return Observed(name, xy, 1 - missed, seen[0].present, seen[0].kind)
 
 
-def _recall(seen: Seen, recall: RecallModel, visible_only: bool) -> FloatArray:
+def _recall(seen: PerceptionResult, recall: RecallModel, visible_only: bool) -> FloatArray:
     rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
     return np.where(seen.area_px2 > 0, rate, 0.0) if visible_only else rate
 
@@ -127,7 +127,7 @@ def _measured(
     recall: RecallModel,
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """By view: summaries over trials by the definition, and with invisible objects undetected."""
-    truth = TruthFrames.join([judge_truth(scenario)])
+    truth = GroundTruthFrames.join([compute_ground_truth(scenario)])
     observed = [
         [observe(scenario, camera, where, recall, visible_only)]
         for visible_only in (False, True)

@@ -19,10 +19,10 @@ from bikeped.config import DecisionConfig, LoadedConfig
 from bikeped.errors import ScenarioError
 from bikeped.lab.result_tables import Cell, Result, Table
 from bikeped.lab.scenarios.scenario import SIZES_M
-from bikeped.lab.simulation.metrics import Metrics, measure, number
+from bikeped.lab.simulation.metrics import Metrics, finite_or_none, measure
 from bikeped.lab.simulation.perception import error_table, localise
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, camera_json, compare, compare_json
-from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, TruthSettings
+from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruthSettings
 from bikeped.types import BoolArray, State
 
 Progress = Callable[[int], None]
@@ -96,7 +96,7 @@ def run_table(suite: Suite, decision: DecisionConfig) -> Result:
     metrics = measure(suite.truth_frames, states)
     rows: list[dict[str, Any]] = []
     for index, (scenario, truth) in enumerate(zip(suite.scenarios, suite.truths, strict=True)):
-        frames = states[suite.run.lane_slice(index)]
+        frames = states[suite.rule_input.frame_slice(index)]
         share = np.bincount(frames, minlength=len(State)) / len(frames)
         rows.append(
             {
@@ -215,7 +215,7 @@ def errors(suite: Suite) -> Result:
         maps[kind] = {
             "x_m": x.tolist(),
             "y_m": y.tolist(),
-            "error_m": [[number(v) for v in row] for row in error.reshape(len(x), len(y))],
+            "error_m": [[finite_or_none(v) for v in row] for row in error.reshape(len(x), len(y))],
         }
     distances = list(dict.fromkeys(float(row["distance_m"]) for row in table))
     cells = {(r["kind"], r["bearing_deg"], r["distance_m"]): float(r["error_m"]) for r in table}
@@ -239,9 +239,9 @@ def errors(suite: Suite) -> Result:
 
 def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> Result:
     """The same decisions under other thresholds of the ground truth, one varied at a time."""
-    base = TruthSettings(braking=suite.truth_settings.braking)
+    base = GroundTruthSettings(braking=suite.truth_settings.braking)
     states = suite.states(decision)
-    cases: list[tuple[str, float | None, TruthSettings]] = [
+    cases: list[tuple[str, float | None, GroundTruthSettings]] = [
         *(("cpa_radius_m", v, replace(base, cpa_radius_m=v)) for v in CPA_RADII_M),
         *(("stopping_margin", v, replace(base, stopping_margin=v)) for v in STOPPING_MARGINS),
         *(("ttc_bound_s", v, replace(base, ttc_bound_s=v)) for v in TTC_BOUNDS_S),
@@ -307,13 +307,13 @@ def warning_budgets(suite: Suite, decision: DecisionConfig) -> Result:
     for index, (scenario, truth) in enumerate(zip(suite.scenarios, suite.truths, strict=True)):
         if not truth.actionable.any():
             continue
-        alert = states[suite.run.lane_slice(index)] == State.ALERT
+        alert = states[suite.rule_input.frame_slice(index)] == State.ALERT
         onset = onsets(alert) & np.isfinite(truth.budget_s)
-        worst = number(metrics.scenario_min_budget_s[index])
+        worst = finite_or_none(metrics.scenario_min_budget_s[index])
         rows.append(
             {
                 "scenario": scenario.name,
-                "mean": number(metrics.scenario_mean_budget_s[index]),
+                "mean": finite_or_none(metrics.scenario_mean_budget_s[index]),
                 "min": worst,
                 "onsets": [float(v) for v in truth.budget_s[onset]],
                 "class": budget_class(worst),

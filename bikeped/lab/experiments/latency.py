@@ -19,7 +19,7 @@ from bikeped.lab.experiments.montecarlo import (
     summaries,
 )
 from bikeped.lab.result_tables import Result, Table
-from bikeped.lab.simulation.metrics import TruthFrames
+from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.simulate import FPS, track
 from bikeped.lab.simulation.suite import Suite
@@ -49,9 +49,11 @@ def delay_frames(delay_ms: float) -> int:
 
 def sweep(suite: Suite, decision: DecisionConfig, delays_ms: Sequence[float] = DELAYS_MS) -> Result:
     """Every latency with every predictor, without loss: all of them lanes of one tracker."""
-    scenes = [s for ms in delays_ms for s in suite.scenes(delay_frames=delay_frames(ms))]
+    scenes = [
+        s for ms in delays_ms for s in suite.detection_sequences(delay_frames=delay_frames(ms))
+    ]
     tracked = track(scenes)
-    truth: TruthFrames = suite.truth_frames
+    truth: GroundTruthFrames = suite.truth_frames
     data: dict[str, Any] = {"delay_ms": list(delays_ms)}
     for name, order in PREDICTORS.items():
         found = measure_lanes(tracked, order, truth, {"": decision})[""]

@@ -23,9 +23,22 @@ from bikeped.errors import BikepedError
 from bikeped.lab.experiments.deterministic import Progress, percent, quiet
 from bikeped.lab.process_pool import workers
 from bikeped.lab.result_tables import Result, Table
-from bikeped.lab.simulation.metrics import Metrics, TruthFrames, measure
-from bikeped.lab.simulation.perception import RecallMode, RecallModel, Seen, lost, trial_generator
-from bikeped.lab.simulation.simulate import Scene, Tracked, delayed, rows_of, states, track
+from bikeped.lab.simulation.metrics import GroundTruthFrames, Metrics, measure
+from bikeped.lab.simulation.perception import (
+    PerceptionResult,
+    RecallMode,
+    RecallModel,
+    missed_detections,
+    trial_generator,
+)
+from bikeped.lab.simulation.simulate import (
+    DetectionSequence,
+    TrackHistory,
+    build_rule_input,
+    delay_history,
+    states,
+    track,
+)
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.types import BoolArray, FloatArray, KindArray
 
@@ -57,18 +70,21 @@ class Observed:
     kind: KindArray
 
     @staticmethod
-    def of(name: str, seen: Seen, recall: RecallModel) -> Observed:
+    def of(name: str, seen: PerceptionResult, recall: RecallModel) -> Observed:
         rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
         return Observed(name, seen.observed_m, rate, seen.present, seen.kind)
 
-    def trials(self, trials: Sequence[int], seed: int, burst: float | None) -> list[Scene]:
+    def trials(
+        self, trials: Sequence[int], seed: int, burst: float | None
+    ) -> list[DetectionSequence]:
         """The detections of each trial."""
         draw = np.stack(
             [trial_generator(seed, self.name, t).random(self.recall.shape) for t in trials], axis=1
         )
-        missed = lost(draw, self.recall[:, None], self.present[:, None], burst)
+        missed = missed_detections(draw, self.recall[:, None], self.present[:, None], burst)
         return [
-            Scene(self.xy_m, self.present & ~missed[:, i], self.kind) for i in range(len(trials))
+            DetectionSequence(self.xy_m, self.present & ~missed[:, i], self.kind)
+            for i in range(len(trials))
         ]
 
 
@@ -84,7 +100,7 @@ class Plan:
 
 def simulate_trials(
     observed: Sequence[Observed],
-    truth: TruthFrames,
+    truth: GroundTruthFrames,
     plan: Plan,
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
@@ -97,7 +113,7 @@ def simulate_trials(
 
 def simulate_views(
     views: Sequence[Sequence[Observed]],
-    truth: TruthFrames,
+    truth: GroundTruthFrames,
     plan: Plan,
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
@@ -114,7 +130,7 @@ def simulate_views(
     ]
     for begin in range(0, len(units), size):
         part = units[begin : begin + size]
-        scenes: list[Scene] = []
+        scenes: list[DetectionSequence] = []
         for view in dict.fromkeys(v for v, _ in part):
             mine = [trial for v, trial in part if v == view]
             by_scenario = [o.trials(mine, seed, plan.burst) for o in views[view]]
@@ -122,7 +138,7 @@ def simulate_views(
             scenes += [lanes[i] for i in range(len(mine)) for lanes in by_scenario]
         tracked = track(scenes)
         for delay in dict.fromkeys(delay for delay, _ in plan.cases):
-            late = delayed(tracked, delay)
+            late = delay_history(tracked, delay)
             for case in plan.cases:
                 if case[0] != delay:
                     continue
@@ -134,10 +150,13 @@ def simulate_views(
 
 
 def measure_lanes(
-    tracked: Tracked, order: int, truth: TruthFrames, configurations: Mapping[str, DecisionConfig]
+    tracked: TrackHistory,
+    order: int,
+    truth: GroundTruthFrames,
+    configurations: Mapping[str, DecisionConfig],
 ) -> TrialMetrics:
     """Metrics of every repetition of the suite among the lanes, by configuration."""
-    run = rows_of(tracked, order)
+    run = build_rule_input(tracked, order)
     repeats = tracked.lanes // truth.count
     return {
         name: [
@@ -163,7 +182,7 @@ def plan_trials(
     """`simulate_trials` of a suite (in order of names), one job of a process."""
     observed = [
         Observed.of(s.name, seen, plan.recall)
-        for s, seen in zip(suite.scenarios, suite.seen, strict=True)
+        for s, seen in zip(suite.scenarios, suite.perception_results, strict=True)
     ]
     return simulate_trials(observed, suite.truth_frames, plan, configurations, trials, seed)
 

@@ -83,7 +83,7 @@ def optimize(
     progress: Progress = quiet,
 ) -> Result:
     """The best parameters for this suite. Progress counts evaluations."""
-    truth, run = suite.truth_frames, suite.run
+    truth, run = suite.truth_frames, suite.rule_input
     if not truth.actionable.any():
         raise ScenarioError(
             "optimize: no scenario has an actionable danger frame; add one with a closing cyclist"

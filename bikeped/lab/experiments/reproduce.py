@@ -231,7 +231,7 @@ def reproduce(
         write_whole(data_folder / f"{name}.json", _json(document))
         progress(len(found))
 
-    _ = suite.truth_frames, suite.run  # made once, before the suite goes to every process
+    _ = suite.truth_frames, suite.rule_input  # made once, before the suite goes to every process
     missing = [name for name in EXPERIMENTS if name not in found]
     pictures: dict[str, list[Path]] = {}
     if processes > 1:

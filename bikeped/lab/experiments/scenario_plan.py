@@ -206,7 +206,7 @@ def _alerts(axes: Axes, suite: Suite, decision: DecisionConfig, index: int) -> N
     """Where the frame's cyclist and pedestrian truly were when each alert began."""
     scenario, truth = suite.scenarios[index], suite.truths[index]
     agents = {a.id: a for a in scenario.agents}
-    state = suite.states(decision)[suite.run.lane_slice(index)]
+    state = suite.states(decision)[suite.rule_input.frame_slice(index)]
     for frame in np.nonzero(onsets(state))[0]:
         pair = (int(truth.cyclist[frame]), int(truth.pedestrian[frame]))
         found = [agents[i].at(float(truth.time_s[frame])) for i in pair if i in agents]

@@ -21,7 +21,7 @@ from bikeped.lab.plotting import (
 )
 from bikeped.lab.simulation.simulate import verdicts
 from bikeped.lab.simulation.suite import Suite
-from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, Truth
+from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.types import BoolArray, FloatArray, State
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ _TOP_M = 30.0
 def draw_strip(suite: Suite, decision: DecisionConfig, index: int, folder: Path) -> list[Path]:
     """Writes `<scenario>-strip.png` and `.pdf` of the suite's scenario `index`."""
     scenario, truth = suite.scenarios[index], suite.truths[index]
-    part = suite.run.lane_slice(index)
+    part = suite.rule_input.frame_slice(index)
     state = suite.states(decision)[part]
     title = f"{scenario.name}: distance, danger and alerts"
     caption = (
@@ -87,7 +87,7 @@ def spans(mask: BoolArray, time_s: FloatArray) -> list[tuple[float, float]]:
     ]
 
 
-def _shade(axes: Axes, truth: Truth) -> None:
+def _shade(axes: Axes, truth: GroundTruth) -> None:
     for begin, end in spans(truth.actionable, truth.time_s):
         axes.axvspan(begin, end, color="#fbd9a0", alpha=0.75, linewidth=0, zorder=0)
     for begin, end in spans(truth.imminent, truth.time_s):
@@ -100,11 +100,11 @@ def _distances(axes: Axes, suite: Suite, decision: DecisionConfig, index: int) -
     truth = suite.truths[index]
     nearest = np.where(np.isfinite(truth.nearest_m), truth.nearest_m, np.nan)
     axes.plot(truth.time_s, nearest, color=BLUE, zorder=3)
-    part = suite.run.lane_slice(index)
-    found = verdicts(suite.run, rule_settings(decision))
-    frame = suite.run.rows.frame[suite.run.pairs.pedestrian_row]
+    part = suite.rule_input.frame_slice(index)
+    found = verdicts(suite.rule_input, rule_settings(decision))
+    frame = suite.rule_input.rows.frame[suite.rule_input.pairs.pedestrian_row]
     fired = found.fires & (frame >= part.start) & (frame < part.stop)
-    seconds = suite.run.time_s[frame[fired]]
+    seconds = suite.rule_input.time_s[frame[fired]]
     axes.plot(seconds, found.distance_m[fired], ".", color=RED, markersize=3, zorder=4)
     if np.isfinite(nearest).any():
         top = float(np.nanmax(nearest))
@@ -121,7 +121,7 @@ def _distances(axes: Axes, suite: Suite, decision: DecisionConfig, index: int) -
     axes.set_ylabel("distance, m")
 
 
-def _moments(axes: Axes, truth: Truth, onset: BoolArray) -> None:
+def _moments(axes: Axes, truth: GroundTruth, onset: BoolArray) -> None:
     """Onsets with their budget, the closest approach, and the time that a person needs."""
     top = axes.get_ylim()[1]
     last_label = -np.inf

@@ -20,7 +20,7 @@ from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig, config_hash, rule_settings
 from bikeped.config.provenance import decision_hash
 from bikeped.errors import BikepedError
-from bikeped.lab.simulation.simulate import Run, verdicts
+from bikeped.lab.simulation.simulate import RuleInput, verdicts
 from bikeped.lab.simulation.suite import Suite, camera_json
 from bikeped.types import FloatArray, State
 
@@ -52,7 +52,7 @@ def audit_records(
     suite: Suite, decision: DecisionConfig, loaded: LoadedConfig, seed: int = 0
 ) -> Iterator[dict[str, Any]]:
     """The records of all scenarios in order, header first."""
-    run = suite.run
+    run = suite.rule_input
     states = suite.states(decision)
     fired = _first_fired(run, decision)
     rows_of_frame = np.searchsorted(run.rows.frame, np.arange(len(run.time_s) + 1))
@@ -68,7 +68,7 @@ def audit_records(
         "decision": msgspec.to_builtins(decision),
     }
     for lane, scenario in enumerate(suite.scenarios):
-        frames = run.lane_slice(lane)
+        frames = run.frame_slice(lane)
         yield {
             "type": "header",
             "scenario": scenario.name,
@@ -79,7 +79,7 @@ def audit_records(
             "agents": [{"id": a.id, "kind": a.kind} for a in scenario.agents],
             **common,
         }
-        truth, seen = suite.truths[lane], suite.seen[lane]
+        truth, seen = suite.truths[lane], suite.perception_results[lane]
         error = seen.error_m
         for i, frame in enumerate(range(frames.start, frames.stop)):
             known = truth.cyclist[i] >= 0
@@ -118,7 +118,7 @@ def audit_records(
             }
 
 
-def _first_fired(run: Run, decision: DecisionConfig) -> dict[int, dict[str, Any]]:
+def _first_fired(run: RuleInput, decision: DecisionConfig) -> dict[int, dict[str, Any]]:
     """By frame: the first pair in track order that fired, as the pole would name it, and why."""
     found = verdicts(run, rule_settings(decision))
     pairs, rows = run.pairs, run.rows

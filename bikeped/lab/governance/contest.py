@@ -20,9 +20,9 @@ from bikeped.config.provenance import decision_hash
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.lab.governance.gates import all_hold, check
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
-from bikeped.lab.simulation.metrics import Metrics, number
+from bikeped.lab.simulation.metrics import Metrics, finite_or_none
 from bikeped.lab.simulation.suite import Suite
-from bikeped.lab.simulation.truth import BRAKING, TruthSettings
+from bikeped.lab.simulation.truth import BRAKING_PROFILES, GroundTruthSettings
 from bikeped.types import BoolArray, State
 
 _TRUTH_RANGE = {"cpa_radius_m": 25.0, "stopping_margin": 10.0, "ttc_bound_s": 60.0}
@@ -43,7 +43,7 @@ class Side:
 
     def part(self, name: str) -> slice:
         """Where a scenario's frames lie."""
-        return self.suite.run.lane_slice(self.suite.names.index(name))
+        return self.suite.rule_input.frame_slice(self.suite.names.index(name))
 
     def as_dict(self) -> dict[str, Any]:
         """Totals, gates and figures by scenario, for JSON."""
@@ -116,7 +116,7 @@ def with_scenarios(suite: Suite, added: Sequence[Scenario]) -> Suite:
     return Suite((*kept, *new.values()), suite.camera, suite.pose, suite.truth_settings)
 
 
-def parse_truth(settings: TruthSettings, items: Sequence[str]) -> TruthSettings:
+def parse_truth(settings: GroundTruthSettings, items: Sequence[str]) -> GroundTruthSettings:
     """`KEY=VALUE` items over ground-truth thresholds; BikepedError names the key and the mend."""
     for item in items:
         key, equals, text = (part.strip() for part in item.partition("="))
@@ -124,8 +124,8 @@ def parse_truth(settings: TruthSettings, items: Sequence[str]) -> TruthSettings:
         if not equals:
             raise BikepedError(f"{said}: expected KEY=VALUE, e.g. --truth cpa_radius_m=7")
         if key == "braking":
-            if text not in BRAKING:
-                raise BikepedError(f"{said}: unknown profile; use one of {', '.join(BRAKING)}")
+            if text not in BRAKING_PROFILES:
+                raise BikepedError(f"{said}: unknown profile; use one of {', '.join(BRAKING_PROFILES)}")
             settings = replace(settings, braking=text)
         elif key in _TRUTH_RANGE:
             value = _float(text, said)
@@ -178,7 +178,7 @@ def apply_bounds(decision: DecisionConfig, items: Sequence[str]) -> DecisionConf
     return decision
 
 
-def truth_dict(settings: TruthSettings) -> dict[str, Any]:
+def truth_dict(settings: GroundTruthSettings) -> dict[str, Any]:
     """The thresholds of ground truth for JSON; null: the definition's own."""
     return {
         "cpa_radius_m": settings.cpa_radius_m,
@@ -216,8 +216,8 @@ def _spans(
     ends = [*edges[1:], len(code)]
     return [
         {
-            "from_s": number(round(float(time_s[a]), 4)),
-            "to_s": number(round(float(time_s[b - 1]), 4)),
+            "from_s": finite_or_none(round(float(time_s[a]), 4)),
+            "to_s": finite_or_none(round(float(time_s[b - 1]), 4)),
             "before": State(int(before[a])).name,
             "after": State(int(after[a])).name,
         }

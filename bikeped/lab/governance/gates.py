@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bikeped.lab.simulation.metrics import Metrics, number
+from bikeped.lab.simulation.metrics import Metrics, finite_or_none
 from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S
 
 SENSITIVITY_MIN = 0.90
@@ -61,7 +61,7 @@ class Gate:
             "required": self.required,
             "strict": self.strict,
             "unit": self.unit,
-            "measured": number(self.measured),
+            "measured": finite_or_none(self.measured),
             "holds": self.holds,
         }
 

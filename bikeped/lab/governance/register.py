@@ -182,7 +182,7 @@ def build(suite: Suite, decision: DecisionConfig) -> Register:
     states = suite.states(decision)
     figures = {}
     for index, name in enumerate(suite.names):
-        alert = states[suite.run.lane_slice(index)] == int(State.ALERT)
+        alert = states[suite.rule_input.frame_slice(index)] == int(State.ALERT)
         danger = suite.truths[index].danger
         figures[name] = {
             **metrics.scenario_dict(index),

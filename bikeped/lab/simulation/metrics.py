@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.lab.simulation.simulate import FPS
-from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, Truth
+from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.types import BoolArray, FloatArray, IntArray, State
 
 #: An episode in which a cyclist and a pedestrian came this near is a nuisance, not a false alarm.
@@ -23,7 +23,7 @@ NO_ALERT_LATENCY_S = 5.0
 
 
 @dataclass(frozen=True)
-class TruthFrames:
+class GroundTruthFrames:
     """The truths of several scenarios (or trials), frame after frame."""
 
     start: IntArray
@@ -39,7 +39,7 @@ class TruthFrames:
     count: int = field(default=0)
 
     @staticmethod
-    def join(truths: Sequence[Truth]) -> TruthFrames:
+    def join(truths: Sequence[GroundTruth]) -> GroundTruthFrames:
         lengths = np.asarray([len(t.time_s) for t in truths])
         closest = [
             float(t.time_s[int(np.argmin(t.nearest_m))])
@@ -47,7 +47,7 @@ class TruthFrames:
             else np.nan
             for t in truths
         ]
-        return TruthFrames(
+        return GroundTruthFrames(
             start=np.concatenate([[0], np.cumsum(lengths)[:-1]]),
             scenario=np.repeat(np.arange(len(truths)), lengths),
             time_s=np.concatenate([t.time_s for t in truths]),
@@ -97,16 +97,16 @@ class Metrics:
     def as_dict(self) -> dict[str, Any]:
         """The totals for JSON; a figure that is not there is null."""
         return {
-            "sensitivity": number(self.sensitivity),
-            "specificity": number(self.specificity),
-            "contact_sensitivity": number(self.contact_sensitivity),
-            "sev_fn": number(self.sev_fn),
-            "fatigue": number(self.fatigue),
-            "mean_alert_latency_s": number(self.mean_alert_latency_s),
-            "mean_warning_budget_s": number(self.mean_warning_budget_s),
-            "adequate_share": number(self.adequate_share),
-            "false_episodes_per_hour": number(self.false_episodes_per_hour),
-            "nuisance_episodes_per_hour": number(self.nuisance_episodes_per_hour),
+            "sensitivity": finite_or_none(self.sensitivity),
+            "specificity": finite_or_none(self.specificity),
+            "contact_sensitivity": finite_or_none(self.contact_sensitivity),
+            "sev_fn": finite_or_none(self.sev_fn),
+            "fatigue": finite_or_none(self.fatigue),
+            "mean_alert_latency_s": finite_or_none(self.mean_alert_latency_s),
+            "mean_warning_budget_s": finite_or_none(self.mean_warning_budget_s),
+            "adequate_share": finite_or_none(self.adequate_share),
+            "false_episodes_per_hour": finite_or_none(self.false_episodes_per_hour),
+            "nuisance_episodes_per_hour": finite_or_none(self.nuisance_episodes_per_hour),
             "true_positive": self.true_positive,
             "false_positive": self.false_positive,
             "false_negative": self.false_negative,
@@ -116,23 +116,23 @@ class Metrics:
     def scenario_dict(self, index: int) -> dict[str, Any]:
         """One scenario's figures for JSON."""
         return {
-            "sensitivity": number(self.scenario_sensitivity[index]),
-            "specificity": number(self.scenario_specificity[index]),
-            "sev_fn": number(self.scenario_sev_fn[index]),
-            "fatigue": number(self.scenario_fatigue[index]),
-            "alert_latency_s": number(self.scenario_alert_latency_s[index]),
-            "mean_warning_budget_s": number(self.scenario_mean_budget_s[index]),
-            "min_warning_budget_s": number(self.scenario_min_budget_s[index]),
-            "first_onset_lead_s": number(self.scenario_first_onset_lead_s[index]),
+            "sensitivity": finite_or_none(self.scenario_sensitivity[index]),
+            "specificity": finite_or_none(self.scenario_specificity[index]),
+            "sev_fn": finite_or_none(self.scenario_sev_fn[index]),
+            "fatigue": finite_or_none(self.scenario_fatigue[index]),
+            "alert_latency_s": finite_or_none(self.scenario_alert_latency_s[index]),
+            "mean_warning_budget_s": finite_or_none(self.scenario_mean_budget_s[index]),
+            "min_warning_budget_s": finite_or_none(self.scenario_min_budget_s[index]),
+            "first_onset_lead_s": finite_or_none(self.scenario_first_onset_lead_s[index]),
         }
 
 
-def number(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
     """A figure for JSON: null where there is none."""
     return float(value) if np.isfinite(value) else None
 
 
-def measure(truth: TruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
+def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
     """All figures of states [f] against the truth of the same frames."""
     alert = states == int(State.ALERT)
     n, scenario = truth.count, truth.scenario
@@ -196,7 +196,7 @@ def measure(truth: TruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
     )
 
 
-def _alert_latency(truth: TruthFrames, alert: BoolArray) -> FloatArray:
+def _alert_latency(truth: GroundTruthFrames, alert: BoolArray) -> FloatArray:
     """By scenario: from the first actionable frame to the next ALERT frame."""
     n = truth.count
     first = np.full(n, np.inf)
@@ -209,7 +209,7 @@ def _alert_latency(truth: TruthFrames, alert: BoolArray) -> FloatArray:
         return np.where(np.isfinite(first), answered - first, np.nan)
 
 
-def _episodes(truth: TruthFrames, alert: BoolArray, onset: BoolArray) -> tuple[int, int]:
+def _episodes(truth: GroundTruthFrames, alert: BoolArray, onset: BoolArray) -> tuple[int, int]:
     """ALERT episodes without a danger frame: false ones, and nuisances (a pair came near)."""
     if not alert.any():
         return 0, 0

@@ -62,7 +62,7 @@ class RecallModel:
 
 
 @dataclass(frozen=True)
-class Seen:
+class PerceptionResult:
     """One scenario through one camera: arrays over frames and agents [f, a].
 
     Positions are in the camera ground frame; NaN where `present` is false. `observed_m` carries the
@@ -81,7 +81,9 @@ class Seen:
         return np.asarray(np.sqrt(((self.observed_m - self.true_m) ** 2).sum(-1)))
 
 
-def see(scenario: Scenario, camera: GroundCamera, pose: CameraPose = SIMULATION_POSE) -> Seen:
+def simulate_perception(
+    scenario: Scenario, camera: GroundCamera, pose: CameraPose = SIMULATION_POSE
+) -> PerceptionResult:
     """Every agent of every frame as the camera would localise it."""
     time_s = scenario.frame_times()
     frames, agents = len(time_s), len(scenario.agents)
@@ -99,7 +101,7 @@ def see(scenario: Scenario, camera: GroundCamera, pose: CameraPose = SIMULATION_
         observed[there, index] = put
         area[there, index] = size
     kind = np.asarray([KIND_OF[a.kind] for a in scenario.agents], np.int8)
-    return Seen(true, observed, area, present, kind)
+    return PerceptionResult(true, observed, area, present, kind)
 
 
 def localise(
@@ -176,11 +178,11 @@ def trial_generator(seed: int, name: str, trial: int) -> np.random.Generator:
 def misses(
     recall: FloatArray, present: BoolArray, rng: np.random.Generator, burst: float | None = None
 ) -> BoolArray:
-    """Which detections [f, a] of one trial are missed; see `lost`."""
-    return lost(rng.random(recall.shape), recall, present, burst)
+    """Which detections [f, a] of one trial are missed; see `missed_detections`."""
+    return missed_detections(rng.random(recall.shape), recall, present, burst)
 
 
-def lost(
+def missed_detections(
     draw: FloatArray, recall: FloatArray, present: BoolArray, burst: float | None = None
 ) -> BoolArray:
     """Which detections are missed; frames along the first axis, any number of trials and agents

@@ -31,7 +31,7 @@ SIMULATION_TRACKER = TrackerSettings()
 
 
 @dataclass(frozen=True)
-class Scene:
+class DetectionSequence:
     """Detections of one lane: positions [f, a, 2] in the camera ground frame, `detected` [f, a]."""
 
     xy_m: FloatArray
@@ -41,10 +41,10 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Tracked:
+class TrackHistory:
     """What the tracker reported in every lane and frame, as arrays [f, lane, slot].
 
-    Before prediction: `rows_of` makes the rows that the rules read.
+    Before prediction: `build_rule_input` makes the rows that the rules read.
     """
 
     reported: BoolArray
@@ -61,7 +61,9 @@ class Tracked:
         return len(self.frames)
 
 
-def track(scenes: Sequence[Scene], settings: TrackerSettings = SIMULATION_TRACKER) -> Tracked:
+def track(
+    scenes: Sequence[DetectionSequence], settings: TrackerSettings = SIMULATION_TRACKER
+) -> TrackHistory:
     """Runs the tracker over all scenes side by side."""
     lanes = len(scenes)
     frames = np.asarray([len(s.xy_m) for s in scenes])
@@ -90,7 +92,7 @@ def track(scenes: Sequence[Scene], settings: TrackerSettings = SIMULATION_TRACKE
             array[frame] = now
     inside = np.arange(longest)[:, None] < frames[None, :]
     reported, number, kinds, position, velocity, acceleration = history
-    return Tracked(
+    return TrackHistory(
         reported=reported & inside[..., None],
         id=number,
         kind=kinds,
@@ -102,7 +104,7 @@ def track(scenes: Sequence[Scene], settings: TrackerSettings = SIMULATION_TRACKE
     )
 
 
-def delayed(tracked: Tracked, frames: int) -> Tracked:
+def delay_history(tracked: TrackHistory, frames: int) -> TrackHistory:
     """What the tracker reports when the same detections come `frames` frames later.
 
     A tracker knows time differences only, so its report is the same, later; nothing until then.
@@ -131,7 +133,7 @@ def delayed(tracked: Tracked, frames: int) -> Tracked:
 
 
 def _arrays(tracker: BatchTracker) -> tuple[np.ndarray, ...]:  # type: ignore[type-arg]
-    """What is kept of every frame, in the order of `Tracked`."""
+    """What is kept of every frame, in the order of `TrackHistory`."""
     return (
         tracker.reported,
         tracker.id,
@@ -148,7 +150,7 @@ def _history(frames: int, tracker: BatchTracker) -> list[np.ndarray]:  # type: i
 
 
 @dataclass(frozen=True)
-class Run:
+class RuleInput:
     """Track rows of all lanes with their pairs: what any number of rules can be asked of.
 
     Frames are counted over all lanes in turn: frame `start[lane] + i` is frame i of a lane.
@@ -162,13 +164,13 @@ class Run:
     pedestrian: BoolArray
     cyclist_last_s: FloatArray
 
-    def lane_slice(self, lane: int) -> slice:
+    def frame_slice(self, lane: int) -> slice:
         """Where a lane's frames lie in arrays over all frames."""
         begin = int(self.start[lane])
         return slice(begin, begin + int(self.frames[lane]))
 
 
-def rows_of(tracked: Tracked, order: int = 0) -> Run:
+def build_rule_input(tracked: TrackHistory, order: int = 0) -> RuleInput:
     """The rows that the rules read, predicted ahead by each lane's delay with `order`."""
     # Lane-major order, so that a lane's frames are neighbours.
     reported = tracked.reported.transpose(1, 0, 2)
@@ -206,7 +208,7 @@ def rows_of(tracked: Tracked, order: int = 0) -> Run:
     for begin, count in zip(start, tracked.frames, strict=True):
         part = last[begin : begin + count]
         np.maximum.accumulate(part, out=part)
-    return Run(
+    return RuleInput(
         rows=rows,
         pairs=pair_rows(rows, total),
         start=start,
@@ -217,12 +219,14 @@ def rows_of(tracked: Tracked, order: int = 0) -> Run:
     )
 
 
-def verdicts(run: Run, settings: RuleSettings) -> PairChecks:
+def verdicts(run: RuleInput, settings: RuleSettings) -> PairChecks:
     """What the rule says of every pair of every frame."""
     return evaluate_rule(run.rows, run.pairs, settings)
 
 
-def states(run: Run, settings: RuleSettings) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
+def states(
+    run: RuleInput, settings: RuleSettings
+) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
     """State codes of every frame of every lane, lane after lane."""
     fired = verdicts(run, settings).fires
     approaching = frame_mask(run.rows.frame[run.pairs.pedestrian_row[fired]], len(run.time_s))

@@ -14,13 +14,19 @@ import numpy.typing as npt
 from bikeped.config import DecisionConfig, LoadedConfig, ground_camera, rule_settings
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
-from bikeped.lab.simulation.metrics import Metrics, TruthFrames, measure
-from bikeped.lab.simulation.perception import SIMULATION_POSE, Seen, see
-from bikeped.lab.simulation.simulate import Run, Scene, rows_of, states, track
-from bikeped.lab.simulation.truth import Truth, TruthSettings, judge_truth
+from bikeped.lab.simulation.metrics import GroundTruthFrames, Metrics, measure
+from bikeped.lab.simulation.perception import SIMULATION_POSE, PerceptionResult, simulate_perception
+from bikeped.lab.simulation.simulate import (
+    DetectionSequence,
+    RuleInput,
+    build_rule_input,
+    states,
+    track,
+)
+from bikeped.lab.simulation.truth import GroundTruth, GroundTruthSettings, compute_ground_truth
 
 _SELECTED = DecisionConfig()
-DEFAULT_TRUTH = TruthSettings()
+DEFAULT_GROUND_TRUTH = GroundTruthSettings()
 
 #: The configurations and rules that are compared (definitions, section 8).
 CONFIGURATIONS: dict[str, DecisionConfig] = {
@@ -64,7 +70,7 @@ class Suite:
     scenarios: tuple[Scenario, ...]
     camera: GroundCamera
     pose: CameraPose = SIMULATION_POSE
-    truth_settings: TruthSettings = DEFAULT_TRUTH
+    truth_settings: GroundTruthSettings = DEFAULT_GROUND_TRUTH
 
     @staticmethod
     def load(scenarios: Sequence[Scenario], loaded: LoadedConfig) -> Suite:
@@ -75,16 +81,16 @@ class Suite:
         return tuple(s.name for s in self.scenarios)
 
     @cached_property
-    def truths(self) -> tuple[Truth, ...]:
-        return tuple(judge_truth(s, self.truth_settings) for s in self.scenarios)
+    def truths(self) -> tuple[GroundTruth, ...]:
+        return tuple(compute_ground_truth(s, self.truth_settings) for s in self.scenarios)
 
     @cached_property
-    def truth_frames(self) -> TruthFrames:
-        return TruthFrames.join(self.truths)
+    def truth_frames(self) -> GroundTruthFrames:
+        return GroundTruthFrames.join(self.truths)
 
     @cached_property
-    def seen(self) -> tuple[Seen, ...]:
-        return tuple(see(s, self.camera, self.pose) for s in self.scenarios)
+    def perception_results(self) -> tuple[PerceptionResult, ...]:
+        return tuple(simulate_perception(s, self.camera, self.pose) for s in self.scenarios)
 
     @cached_property
     def hash(self) -> str:
@@ -94,27 +100,31 @@ class Suite:
             digest.update(dump_scenario(scenario).encode())
         return digest.hexdigest()
 
-    def scenes(self, localisation_error: bool = True, delay_frames: int = 0) -> list[Scene]:
+    def detection_sequences(
+        self, localisation_error: bool = True, delay_frames: int = 0
+    ) -> list[DetectionSequence]:
         """Every scenario's detections without loss."""
         return [
-            Scene(s.observed_m if localisation_error else s.true_m, s.present, s.kind, delay_frames)
-            for s in self.seen
+            DetectionSequence(
+                s.observed_m if localisation_error else s.true_m, s.present, s.kind, delay_frames
+            )
+            for s in self.perception_results
         ]
 
     @cached_property
-    def run(self) -> Run:
+    def rule_input(self) -> RuleInput:
         """Track rows with localisation error, no loss, no latency."""
         return self._both[0]
 
     @cached_property
-    def run_without_error(self) -> Run:
+    def rule_input_without_error(self) -> RuleInput:
         return self._both[1]
 
     @cached_property
-    def _both(self) -> tuple[Run, Run]:
+    def _both(self) -> tuple[RuleInput, RuleInput]:
         """Both variants in one pass of the tracker, side by side."""
         count = len(self.scenarios)
-        tracked = track([*self.scenes(True), *self.scenes(False)])
+        tracked = track([*self.detection_sequences(True), *self.detection_sequences(False)])
         parts = []
         for lanes in (slice(0, count), slice(count, 2 * count)):
             part = replace(
@@ -128,23 +138,23 @@ class Suite:
                 frames=tracked.frames[lanes],
                 delay_frames=tracked.delay_frames[lanes],
             )
-            parts.append(rows_of(part))
+            parts.append(build_rule_input(part))
         return parts[0], parts[1]
 
     def states(
         self, decision: DecisionConfig, localisation_error: bool = True
     ) -> npt.NDArray[np.int8]:
         """State codes of every frame, scenario after scenario."""
-        run = self.run if localisation_error else self.run_without_error
+        run = self.rule_input if localisation_error else self.rule_input_without_error
         return states(run, rule_settings(decision))
 
     def measure(self, decision: DecisionConfig, localisation_error: bool = True) -> Metrics:
         return measure(self.truth_frames, self.states(decision, localisation_error))
 
-    def with_truth(self, settings: TruthSettings) -> Suite:
+    def with_truth(self, settings: GroundTruthSettings) -> Suite:
         """The same suite under other thresholds; perception is not computed again."""
         other = replace(self, truth_settings=settings)
-        for name in ("seen", "_both", "hash"):
+        for name in ("perception_results", "_both", "hash"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other

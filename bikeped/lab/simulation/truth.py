@@ -46,22 +46,22 @@ KIND_OF: dict[str, Kind] = {
 
 
 @dataclass(frozen=True)
-class Braking:
+class BrakingProfile:
     """A cyclist's reaction time (s) and deceleration (m/s^2)."""
 
     reaction_s: float
     deceleration_mps2: float
 
 
-BRAKING: dict[str, Braking] = {
-    "bicycle": Braking(0.84, 1.96),
-    "ebike": Braking(0.84, 6.0),
-    "aashto": Braking(2.5, 3.4),
+BRAKING_PROFILES: dict[str, BrakingProfile] = {
+    "bicycle": BrakingProfile(0.84, 1.96),
+    "ebike": BrakingProfile(0.84, 6.0),
+    "aashto": BrakingProfile(2.5, 3.4),
 }
 
 
 @dataclass(frozen=True)
-class TruthSettings:
+class GroundTruthSettings:
     """The three free thresholds, and the braking profile (None: by the scenario's vehicle).
 
     `ttc_bound_s` None is the definition's 1.87 s + the pedestrian's clearance time.
@@ -72,12 +72,12 @@ class TruthSettings:
     ttc_bound_s: float | None = None
     braking: str | None = None
 
-    def braking_of(self, scenario: Scenario) -> Braking:
-        return BRAKING[self.braking or scenario.vehicle]
+    def braking_of(self, scenario: Scenario) -> BrakingProfile:
+        return BRAKING_PROFILES[self.braking or scenario.vehicle]
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Ground truth of one scenario, arrays over its frames [f].
 
     `ttc_s` and `budget_s` may be infinite. `cyclist` and `pedestrian` are ids of the frame's pair,
@@ -103,7 +103,9 @@ class Truth:
         return np.asarray(self.danger & ~self.actionable)
 
 
-def judge_truth(scenario: Scenario, settings: TruthSettings = TruthSettings()) -> Truth:
+def compute_ground_truth(
+    scenario: Scenario, settings: GroundTruthSettings = GroundTruthSettings()
+) -> GroundTruth:
     """The ground truth of every frame of a scenario."""
     time_s = scenario.frame_times()
     frames = len(time_s)
@@ -126,7 +128,7 @@ def judge_truth(scenario: Scenario, settings: TruthSettings = TruthSettings()) -
             )
             best.take(pair, cyclist.id, pedestrian.id)
             nearest = np.fmin(nearest, pair.distance)
-    return Truth(
+    return GroundTruth(
         time_s=time_s,
         danger=best.danger,
         actionable=best.danger & (best.ttc >= PEDESTRIAN_PRT_S - _EPSILON),
@@ -165,8 +167,8 @@ def _pair(
     cyclist_xy: FloatArray,
     pedestrian_xy: FloatArray,
     frames: int,
-    settings: TruthSettings,
-    braking: Braking,
+    settings: GroundTruthSettings,
+    braking: BrakingProfile,
 ) -> _PairTruth:
     frame = _FRAME_STRIDE * np.arange(frames)
     gap = cyclist_xy - pedestrian_xy
@@ -254,7 +256,7 @@ class _Best:
         self.pedestrian[at] = pedestrian
 
 
-def with_ttc_bound(settings: TruthSettings, seconds: float) -> TruthSettings:
+def with_ttc_bound(settings: GroundTruthSettings, seconds: float) -> GroundTruthSettings:
     """The same thresholds with a fixed TTC bound."""
     if not (math.isfinite(seconds) and seconds > 0):
         raise ValueError(f"ttc bound: expected seconds above 0, got {seconds}")

@@ -16,9 +16,9 @@ from bikeped.config import DecisionConfig, rule_settings
 from bikeped.decision import PairChecks, explain, is_remembered, pair_metrics, select_pair
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.experiments.deterministic import onsets
-from bikeped.lab.simulation.metrics import measure, number
+from bikeped.lab.simulation.metrics import finite_or_none, measure
 from bikeped.lab.simulation.simulate import FPS, verdicts
-from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, Truth
+from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.lab.testbench.run import BenchSuite
 from bikeped.types import BoolArray, FloatArray, Kind, State
 
@@ -40,7 +40,7 @@ def playback(
         "agents": _agents(suite, index),
         "tracks": _tracks(suite, index),
         "truth": _truth(truth),
-        "closest_s": number(_closest(truth)),
+        "closest_s": finite_or_none(_closest(truth)),
         "prt_s": {"distracted": PEDESTRIAN_PRT_S, "attentive": ATTENTIVE_PRT_S},
         "delay_frames": suite.delay.frames,
         "order": suite.delay.order,
@@ -96,7 +96,11 @@ def coverage(camera: GroundCamera, pose: CameraPose) -> dict[str, Any]:
 
 def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
     """Each agent's true way, and where it was detected in the frame that the tracker gets."""
-    scenario, scene, seen = suite.scenarios[index], suite.scenes_seen[index], suite.seen[index]
+    scenario, scene, seen = (
+        suite.scenarios[index],
+        suite.shown_detections[index],
+        suite.perception_results[index],
+    )
     time_s = suite.truths[index].time_s
     late = suite.delay.frames
     found = []
@@ -126,7 +130,7 @@ def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
 
 def _missed(suite: BenchSuite, index: int, agent: int) -> list[int]:
     """1 in frames whose picture shows an agent that the detector missed."""
-    scene, there = suite.scenes_seen[index], suite.seen[index].present[:, agent]
+    scene, there = suite.shown_detections[index], suite.perception_results[index].present[:, agent]
     missed = (there & ~scene.detected[:, agent]).astype(float)
     return [int(v) for v in np.nan_to_num(_later(missed, suite.delay.frames))]
 
@@ -140,8 +144,8 @@ def _later(values: FloatArray, frames: int) -> FloatArray:
 
 def _tracks(suite: BenchSuite, index: int) -> dict[str, Any]:
     """What the tracker reports, as the rules read it, frame after frame."""
-    run = suite.run
-    frames = run.lane_slice(index)
+    run = suite.rule_input
+    frames = run.frame_slice(index)
     first, last = np.searchsorted(run.rows.frame, [frames.start, frames.stop])
     rows = slice(int(first), int(last))
     start = np.searchsorted(run.rows.frame[rows], np.arange(frames.start, frames.stop + 1))
@@ -153,7 +157,7 @@ def _tracks(suite: BenchSuite, index: int) -> dict[str, Any]:
     }
 
 
-def _truth(truth: Truth) -> dict[str, Any]:
+def _truth(truth: GroundTruth) -> dict[str, Any]:
     return {
         "tier": (truth.danger.astype(int) + truth.imminent).tolist(),
         "distance_m": _some(truth.distance_m),
@@ -167,7 +171,7 @@ def _truth(truth: Truth) -> dict[str, Any]:
     }
 
 
-def _closest(truth: Truth) -> float:
+def _closest(truth: GroundTruth) -> float:
     if not np.isfinite(truth.nearest_m).any():
         return float("nan")
     return float(truth.time_s[int(np.argmin(truth.nearest_m))])
@@ -175,8 +179,8 @@ def _closest(truth: Truth) -> float:
 
 def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) -> dict[str, Any]:
     """One decision on the scenario: states, the sentence and the numbers of every frame."""
-    run, settings = suite.run, rule_settings(decision)
-    frames = run.lane_slice(index)
+    run, settings = suite.rule_input, rule_settings(decision)
+    frames = run.frame_slice(index)
     codes = suite.states(decision)
     found = verdicts(run, settings)
     metrics = measure(suite.truth_frames, codes)
@@ -223,7 +227,7 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
             {
                 "frame": int(i),
                 "t": float(truth.time_s[i]),
-                "budget_s": number(float(truth.budget_s[i])),
+                "budget_s": finite_or_none(float(truth.budget_s[i])),
                 "danger": bool(truth.danger[i]),
             }
             for i in begins
@@ -233,7 +237,7 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
     }
 
 
-def _counts(truth: Truth, alert: BoolArray) -> dict[str, int]:
+def _counts(truth: GroundTruth, alert: BoolArray) -> dict[str, int]:
     """Frames by truth and alert, of this scenario."""
     return {
         "frames": len(alert),
@@ -247,7 +251,7 @@ def _counts(truth: Truth, alert: BoolArray) -> dict[str, int]:
 
 def _pairs(suite: BenchSuite, found: PairChecks, part: slice, start: Any) -> dict[str, Any]:
     """The numbers and the tests of every pair of every frame; `passes` holds a bit a test."""
-    run = suite.run
+    run = suite.rule_input
     cyclist = run.pairs.cyclist_row[run.pairs.cyclist[part]]
     pedestrian = run.pairs.pedestrian_row[part]
     bits = np.zeros(len(cyclist), np.int64)

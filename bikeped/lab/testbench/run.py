@@ -23,11 +23,18 @@ from bikeped.geometry import CameraPose
 from bikeped.lab.experiments.deployment import fuse
 from bikeped.lab.experiments.montecarlo import Observed, Plan, simulate_trials, summaries
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
-from bikeped.lab.simulation.metrics import TruthFrames
-from bikeped.lab.simulation.perception import RecallModel, Seen, see
-from bikeped.lab.simulation.simulate import Run, Scene, Tracked, delayed, rows_of, track
+from bikeped.lab.simulation.metrics import GroundTruthFrames
+from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
+from bikeped.lab.simulation.simulate import (
+    DetectionSequence,
+    RuleInput,
+    TrackHistory,
+    build_rule_input,
+    delay_history,
+    track,
+)
 from bikeped.lab.simulation.suite import Suite
-from bikeped.lab.simulation.truth import Truth, TruthSettings, judge_truth
+from bikeped.lab.simulation.truth import GroundTruth, GroundTruthSettings, compute_ground_truth
 from bikeped.lab.testbench.settings import (
     BenchSettings,
     Delay,
@@ -56,11 +63,11 @@ class BenchSuite(Suite):
         return (self.pose,) if self.second is None else (self.pose, self.second)
 
     @cached_property
-    def seen_second(self) -> tuple[Seen, ...]:
+    def second_perception_results(self) -> tuple[PerceptionResult, ...]:
         """What the second camera makes of every scenario; empty without one."""
         if self.second is None:
             return ()
-        return tuple(see(s, self.camera, self.second) for s in self.scenarios)
+        return tuple(simulate_perception(s, self.camera, self.second) for s in self.scenarios)
 
     @cached_property
     def observed(self) -> tuple[Observed, ...]:
@@ -68,34 +75,34 @@ class BenchSuite(Suite):
         model = self.perception.model() or RecallModel("size")
         found = []
         for i, scenario in enumerate(self.scenarios):
-            views = [self.seen[i], *self.seen_second[i : i + 1]]
+            views = [self.perception_results[i], *self.second_perception_results[i : i + 1]]
             one = fuse(scenario.name, views, self.poses, model)
             if not self.perception.localisation_error:
-                one = replace(one, xy_m=self.seen[i].true_m)
+                one = replace(one, xy_m=self.perception_results[i].true_m)
             found.append(one)
         return tuple(found)
 
     @cached_property
-    def scenes_seen(self) -> tuple[Scene, ...]:
+    def shown_detections(self) -> tuple[DetectionSequence, ...]:
         """The detections of each scenario, in the trial that is shown."""
         late, view = self.delay.frames, self.perception
         if view.model() is None:
-            return tuple(Scene(o.xy_m, o.present, o.kind, late) for o in self.observed)
+            return tuple(DetectionSequence(o.xy_m, o.present, o.kind, late) for o in self.observed)
         return tuple(o.trials([view.trial], view.seed, view.burst_frames)[0] for o in self.observed)
 
     @cached_property
-    def tracked(self) -> Tracked:
-        found = track(self.scenes_seen)
+    def track_history(self) -> TrackHistory:
+        found = track(self.shown_detections)
         # Without misses the delay is in the scenes, as `conformance latency` has it; with them the
         # trial is tracked once and comes late, as `conformance montecarlo` and the sweep do.
-        return found if self.perception.model() is None else delayed(found, self.delay.frames)
+        return found if self.perception.model() is None else delay_history(found, self.delay.frames)
 
     @cached_property
-    def run(self) -> Run:
+    def rule_input(self) -> RuleInput:
         """Track rows as the rules read them, under this perception and delay."""
-        return rows_of(self.tracked, self.delay.order)
+        return build_rule_input(self.track_history, self.delay.order)
 
-    def with_truth(self, settings: TruthSettings) -> BenchSuite:
+    def with_truth(self, settings: GroundTruthSettings) -> BenchSuite:
         """The same suite under other thresholds; perception is not computed again."""
         other = replace(self, truth_settings=settings)
         for name in _KEPT:
@@ -104,7 +111,16 @@ class BenchSuite(Suite):
         return other
 
 
-_KEPT = ("names", "seen", "seen_second", "observed", "scenes_seen", "tracked", "run", "hash")
+_KEPT = (
+    "names",
+    "perception_results",
+    "second_perception_results",
+    "observed",
+    "shown_detections",
+    "track_history",
+    "rule_input",
+    "hash",
+)
 
 
 def trial_summaries(suite: BenchSuite, bench: BenchSettings) -> dict[str, Any] | None:
@@ -117,7 +133,7 @@ def trial_summaries(suite: BenchSuite, bench: BenchSettings) -> dict[str, Any] |
         return None
     order = sorted(range(len(suite.scenarios)), key=lambda i: suite.scenarios[i].name)
     observed = [suite.observed[i] for i in order]
-    truth = TruthFrames.join([suite.truths[i] for i in order])
+    truth = GroundTruthFrames.join([suite.truths[i] for i in order])
     trials = bench.perception.trials
     check_work(suite.scenarios, trials)
     case = (bench.delay.frames, bench.delay.order)
@@ -145,8 +161,8 @@ class BenchRunner:
     def __init__(self, loaded: LoadedConfig, scenarios: Sequence[Scenario]) -> None:
         self.loaded, self.scenarios = loaded, tuple(scenarios)
         self._texts = {id(s): dump_scenario(s) for s in self.scenarios}
-        self._seen: _LruCache[Seen] = _LruCache(400)
-        self._truths: _LruCache[Truth] = _LruCache(400)
+        self._seen: _LruCache[PerceptionResult] = _LruCache(400)
+        self._truths: _LruCache[GroundTruth] = _LruCache(400)
         self._suites: _LruCache[BenchSuite] = _LruCache(12)
         self._own: _LruCache[Scenario] = _LruCache(60)
         self.lock = threading.RLock()
@@ -191,20 +207,24 @@ class BenchRunner:
 
             def make() -> BenchSuite:
                 suite = BenchSuite(
-                    scenarios, camera, pose, TruthSettings(), perception, bench.delay, second
+                    scenarios, camera, pose, GroundTruthSettings(), perception, bench.delay, second
                 )
-                suite.__dict__["seen"] = tuple(
-                    self._seen.get((text, where), partial(see, scenario, camera, pose))
+                suite.__dict__["perception_results"] = tuple(
+                    self._seen.get(
+                        (text, where), partial(simulate_perception, scenario, camera, pose)
+                    )
                     for text, scenario in zip(texts, scenarios, strict=True)
                 )
                 return suite
 
             suite = self._suites.get(key, make)
-            suite.run  # noqa: B018 - computed now, and shared by what follows
+            suite.rule_input  # noqa: B018 - computed now, and shared by what follows
             settings = bench.danger.settings()
             told = suite.with_truth(settings)
             told.__dict__["truths"] = tuple(
-                self._truths.get((text, settings), partial(judge_truth, scenario, settings))
+                self._truths.get(
+                    (text, settings), partial(compute_ground_truth, scenario, settings)
+                )
                 for text, scenario in zip(texts, scenarios, strict=True)
             )
             return told

@@ -24,7 +24,7 @@ from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.experiments.latency import delay_frames
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
 from bikeped.lab.simulation.perception import SIMULATION_POSE, RecallModel
-from bikeped.lab.simulation.truth import TruthSettings
+from bikeped.lab.simulation.truth import GroundTruthSettings
 
 #: A script of somebody's own: what the page draws in a moment, not what a batch computes.
 MAX_SCRIPTS = 30
@@ -123,8 +123,8 @@ class GroundTruthThresholds(Section, frozen=True):
         Meta(description="braking of all cyclists; null: by the scenario's vehicle"),
     ] = None
 
-    def settings(self) -> TruthSettings:
-        return TruthSettings(
+    def settings(self) -> GroundTruthSettings:
+        return GroundTruthSettings(
             self.cpa_radius_m, self.stopping_margin, self.ttc_bound_s, self.braking
         )
 

@@ -17,7 +17,7 @@ from bikeped.lab.endtoend.run import PixelRun, run_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
-from bikeped.lab.simulation.truth import judge_truth
+from bikeped.lab.simulation.truth import compute_ground_truth
 from bikeped.types import Detections, Kind
 
 SIZE = (960, 540)
@@ -32,7 +32,7 @@ def loaded() -> LoadedConfig:
 def scenario() -> Scenario:
     """The shortest one in which somebody must be warned."""
     known = sorted(load_scenarios(bundled_folder()), key=lambda s: s.duration_s)
-    return next(s for s in known if judge_truth(s).actionable.any())
+    return next(s for s in known if compute_ground_truth(s).actionable.any())
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_the_loop_and_the_ladder_decide_alike(
 
 def test_measures_of_a_perfect_eye(run: PixelRun, scenario: Scenario, loaded: LoadedConfig) -> None:
     suite = Suite.load([scenario], loaded)
-    seen = sights([run], suite.seen, loaded)
+    seen = sights([run], suite.perception_results, loaded)
     assert seen.false[Kind.PEDESTRIAN] == len(run.state)
     assert seen.false[Kind.CYCLIST] == seen.false[Kind.VEHICLE] == 0
     rows = [r for r in recall_rows(seen) if r["seen"]]
@@ -114,7 +114,7 @@ def test_an_eye_that_sees_nothing_is_named(
     text = verdict(rungs)
     assert "misses" in text
     assert "not within 3 points" in text
-    seen = sights([blind], suite.seen, loaded)
+    seen = sights([blind], suite.perception_results, loaded)
     result = pixels_result(suite, [blind], rungs, seen, Drawing(*SIZE, "day", "dry", 0, 0))
     assert result.data["goal"]["holds"] is False
     assert result.data["stages"][0]["name"] == "scripted"

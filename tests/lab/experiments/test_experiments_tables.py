@@ -18,9 +18,9 @@ from bikeped.lab.experiments import deployment as dep
 from bikeped.lab.experiments import deterministic as ex
 from bikeped.lab.experiments import optimizer as opt
 from bikeped.lab.scenarios.scenario import SIZES_M, bundled_folder, load_scenarios
-from bikeped.lab.simulation.perception import RecallModel, localise, see
+from bikeped.lab.simulation.perception import RecallModel, localise, simulate_perception
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.lab.simulation.truth import judge_truth
+from bikeped.lab.simulation.truth import compute_ground_truth
 
 CONFIG = Path(__file__).parents[3] / "config.yaml"
 NAMES = ("Bike Approaches Ped", "Multiple VRUs", "Safe Crossing", "Swerving Cyclist")
@@ -201,7 +201,7 @@ def test_road_scenario_meets_in_the_middle(width: int) -> None:
         assert found is not None
         np.testing.assert_allclose(found[0], [5.0, 0.0], atol=1e-9)
     assert np.hypot(*(ride.path[0, 1:] - [5.0, 0.0])) == pytest.approx(20.0)
-    truth = judge_truth(scenario)
+    truth = compute_ground_truth(scenario)
     assert truth.actionable.any()
     assert np.isfinite(truth.ttc_s[truth.actionable]).all()
 
@@ -211,7 +211,7 @@ def test_fusion(suite: Suite) -> None:
     camera = dep.wide_camera(suite.camera, 5.5, 0.0)
     assert math.degrees(2 * camera.lens.max_theta_rad) == pytest.approx(220)
     near, far = dep.poses(40, 2)
-    seen = [see(scenario, camera, pose) for pose in (near, far)]
+    seen = [simulate_perception(scenario, camera, pose) for pose in (near, far)]
     model = RecallModel("size")
     rate = [model.recall(np.broadcast_to(s.kind, s.area_px2.shape), s.area_px2) for s in seen]
     fused = dep.observe(scenario, camera, (near, far))

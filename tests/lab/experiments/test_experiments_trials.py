@@ -23,7 +23,13 @@ from bikeped.lab.experiments.latency import (
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.metrics import measure
 from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator
-from bikeped.lab.simulation.simulate import Scene, delayed, rows_of, states, track
+from bikeped.lab.simulation.simulate import (
+    DetectionSequence,
+    build_rule_input,
+    delay_history,
+    states,
+    track,
+)
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 
 CONFIG = Path(__file__).parents[3] / "config.yaml"
@@ -67,20 +73,20 @@ def test_a_trial_is_what_it_is_alone(suite: Suite, burst: float | None) -> None:
     for trial in range(3):
         for name, decision in TWO.items():
             parts = []
-            for scenario, seen in zip(ordered.scenarios, ordered.seen, strict=True):
+            for scenario, seen in zip(ordered.scenarios, ordered.perception_results, strict=True):
                 kinds = np.broadcast_to(seen.kind, seen.area_px2.shape)
                 recall = plan.recall.recall(kinds, seen.area_px2)
                 rng = trial_generator(7, scenario.name, trial)
                 lost = misses(recall, seen.present, rng, burst)
-                scene = Scene(seen.observed_m, seen.present & ~lost, seen.kind)
-                parts.append(states(rows_of(track([scene])), rule_settings(decision)))
+                scene = DetectionSequence(seen.observed_m, seen.present & ~lost, seen.kind)
+                parts.append(states(build_rule_input(track([scene])), rule_settings(decision)))
             alone = measure(ordered.truth_frames, np.concatenate(parts))
             assert alone.as_dict() == found[name][trial].as_dict()
 
 
 def test_every_third_detection_or_so_is_lost_as_recall_says(suite: Suite) -> None:
     """Bursts are longer, yet as many detections are lost."""
-    seen = suite.seen[1]
+    seen = suite.perception_results[1]
     observed = mc.Observed(
         "x", seen.observed_m, np.full(seen.area_px2.shape, 0.7), seen.present, seen.kind
     )
@@ -94,11 +100,11 @@ def test_every_third_detection_or_so_is_lost_as_recall_says(suite: Suite) -> Non
 def test_a_late_report_is_the_report_of_late_detections(suite: Suite, frames: int) -> None:
     rng = np.random.default_rng(1)
     scenes = [
-        Scene(s.observed_m, s.present & (rng.random(s.present.shape) < 0.7), s.kind)
-        for s in suite.seen
+        DetectionSequence(s.observed_m, s.present & (rng.random(s.present.shape) < 0.7), s.kind)
+        for s in suite.perception_results
     ]
     plain = track([replace(s, delay_frames=frames) for s in scenes])
-    quick = delayed(track(scenes), frames)
+    quick = delay_history(track(scenes), frames)
     np.testing.assert_array_equal(quick.reported, plain.reported)
     np.testing.assert_array_equal(quick.delay_frames, plain.delay_frames)
     at = plain.reported
@@ -115,10 +121,11 @@ def test_sweep_is_each_delay_alone(suite: Suite) -> None:
     for at in (0, 6, 15):
         frames = delay_frames(DELAYS_MS[at])
         assert frames == at
-        tracked = track(suite.scenes(delay_frames=frames))
+        tracked = track(suite.detection_sequences(delay_frames=frames))
         for name, order in PREDICTORS.items():
             alone = measure(
-                suite.truth_frames, states(rows_of(tracked, order), rule_settings(decision))
+                suite.truth_frames,
+                states(build_rule_input(tracked, order), rule_settings(decision)),
             )
             for figure in ("sensitivity", "specificity", "sev_fn", "contact_sensitivity"):
                 assert result.data[name][figure][at] == alone.as_dict()[figure]

@@ -14,7 +14,7 @@ from bikeped.lab.governance import register
 from bikeped.lab.governance.audit_records import write_audit
 from bikeped.lab.governance.contest import apply_bounds, contest, parse_truth, with_scenarios
 from bikeped.lab.scenarios.scenario import parse_scenario
-from bikeped.lab.simulation.suite import DEFAULT_TRUTH, Suite
+from bikeped.lab.simulation.suite import DEFAULT_GROUND_TRUTH, Suite
 from bikeped.types import State
 
 ONE = """
@@ -50,7 +50,7 @@ def test_contest_gives_the_numbers_of_direct_runs(suite):
         assert found[key]["totals"] == metrics.as_dict()
         for i, name in enumerate(suite.names):
             row = found[key]["by_scenario"][name]
-            part = states[suite.run.lane_slice(i)]
+            part = states[suite.rule_input.frame_slice(i)]
             assert row["states"]["ALERT"] == (part == int(State.ALERT)).mean()
             assert sum(row["states"].values()) == pytest.approx(1)
             assert {k: v for k, v in row.items() if k != "states"} == metrics.scenario_dict(i)
@@ -62,7 +62,7 @@ def test_changed_frames_and_spans_are_those_of_the_states(suite):
     before, after = suite.states(DecisionConfig()), suite.states(WEAK)
     by_name = {c["scenario"]: c for c in found.changed}
     for i, name in enumerate(suite.names):
-        part = suite.run.lane_slice(i)
+        part = suite.rule_input.frame_slice(i)
         differs = before[part] != after[part]
         if not differs.any():
             assert name not in by_name
@@ -85,7 +85,9 @@ def test_nothing_changes_against_itself(suite):
 
 
 def test_truth_changes_labels_and_not_states(suite):
-    other = suite.with_truth(parse_truth(DEFAULT_TRUTH, ["cpa_radius_m=0.5", "braking=ebike"]))
+    other = suite.with_truth(
+        parse_truth(DEFAULT_GROUND_TRUTH, ["cpa_radius_m=0.5", "braking=ebike"])
+    )
     found = contest(suite, DecisionConfig(), other, DecisionConfig())
     assert found.changed
     assert all(c["frames_state"] == 0 and c["frames_truth"] > 0 for c in found.changed)
@@ -157,7 +159,7 @@ def test_a_bad_bound_is_named(bound):
 )
 def test_a_bad_threshold_is_named(item):
     with pytest.raises(BikepedError, match="--truth"):
-        parse_truth(DEFAULT_TRUTH, [item])
+        parse_truth(DEFAULT_GROUND_TRUTH, [item])
 
 
 def run(*arguments):
@@ -263,7 +265,7 @@ def test_the_audit_says_what_the_suite_says(tmp_path, suite, loaded):
             place = next(
                 i for i, a in enumerate(suite.scenarios[lane].agents) if a.id == agent["id"]
             )
-            seen = suite.seen[lane]
+            seen = suite.perception_results[lane]
             assert agent["true"] == pytest.approx(seen.true_m[frame["frame"], place], abs=1e-4)
             off = np.hypot(*(np.subtract(agent["observed"], agent["true"])))
             assert agent["error_m"] == pytest.approx(off, abs=3e-4)

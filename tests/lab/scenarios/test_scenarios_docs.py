@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bikeped.lab.scenarios.scenario import HAZARDS, bundled_folder, load_scenarios
 from bikeped.lab.simulation.simulate import FPS
-from bikeped.lab.simulation.truth import judge_truth
+from bikeped.lab.simulation.truth import compute_ground_truth
 
 PAGE = Path(__file__).parents[3] / "docs" / "scenarios.md"
 FOLDER = "../bikeped/conformance/scenarios"
@@ -40,7 +40,7 @@ swerve begins at the closest approach, with no time left.
 
 
 def page(scenarios):
-    truths = {s.name: judge_truth(s) for s in scenarios}
+    truths = {s.name: compute_ground_truth(s) for s in scenarios}
     lines = [
         INTRO.format(
             folder=FOLDER,

@@ -58,7 +58,7 @@ def trace(name, scene):
 @pytest.mark.parametrize("slug", FILES)
 def test_decisions_are_as_written_down(suite, slug):
     index = [Path(s.source).stem for s in suite.scenarios].index(slug)
-    found = trace(suite.names[index], suite.scenes()[index])
+    found = trace(suite.names[index], suite.detection_sequences()[index])
     assert found == (GOLDEN / f"{slug}.txt").read_text(encoding="utf-8"), MEND
 
 
@@ -72,7 +72,7 @@ def main():
         old.unlink()
     loaded = load_config(HERE.parents[2] / "config.yaml")
     suite = Suite.load(load_scenarios(bundled_folder()), loaded)
-    for scenario, scene in zip(suite.scenarios, suite.scenes(), strict=True):
+    for scenario, scene in zip(suite.scenarios, suite.detection_sequences(), strict=True):
         slug = Path(scenario.source).stem
         (GOLDEN / f"{slug}.txt").write_text(trace(scenario.name, scene), encoding="utf-8")
     sys.stdout.write(f"{len(suite.scenarios)} traces in {GOLDEN}\n")

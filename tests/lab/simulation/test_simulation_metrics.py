@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.lab.simulation.metrics import TruthFrames, measure, number
-from bikeped.lab.simulation.truth import Truth
+from bikeped.lab.simulation.metrics import GroundTruthFrames, finite_or_none, measure
+from bikeped.lab.simulation.truth import GroundTruth
 from bikeped.types import State
 
 INF, NAN = math.inf, math.nan
@@ -31,7 +31,7 @@ def truth_of(frames):
         np.array(v) for v in zip(*frames, strict=True)
     )  # fmt: skip
     count = len(frames)
-    return Truth(
+    return GroundTruth(
         time_s=np.arange(count) / 30,
         danger=danger,
         actionable=danger & (ttc >= 1.87),
@@ -48,7 +48,7 @@ def truth_of(frames):
 
 def measured(scenarios):
     states = np.array([f[5] for frames in scenarios for f in frames], np.int8)
-    return measure(TruthFrames.join([truth_of(f) for f in scenarios]), states)
+    return measure(GroundTruthFrames.join([truth_of(f) for f in scenarios]), states)
 
 
 def ratio(part, whole):
@@ -221,7 +221,7 @@ def test_json_has_null_where_there_is_no_figure():
     assert found.as_dict()["sensitivity"] is None
     assert found.as_dict()["specificity"] == 1.0
     assert found.scenario_dict(0)["alert_latency_s"] is None
-    assert number(INF) is None
+    assert finite_or_none(INF) is None
     assert set(found.as_dict()) >= {
         "sensitivity", "specificity", "sev_fn", "fatigue", "mean_warning_budget_s",
         "true_positive", "false_positive", "false_negative", "true_negative",

@@ -12,7 +12,7 @@ from bikeped.lab.simulation.perception import (
     RecallModel,
     error_table,
     localise,
-    lost,
+    missed_detections,
     misses,
     trial_generator,
 )
@@ -77,7 +77,7 @@ def test_localisation_errors_of_the_paper(suite, kind):
 
 def test_every_agent_of_the_24_lies_where_a_scalar_projection_puts_it(suite):
     compared = 0
-    for scenario, seen in zip(suite.scenarios, suite.seen, strict=True):
+    for scenario, seen in zip(suite.scenarios, suite.perception_results, strict=True):
         times = scenario.frame_times()
         for index, agent in enumerate(scenario.agents):
             for frame in range(7, len(times), 29):
@@ -106,7 +106,7 @@ def test_an_object_outside_the_picture_keeps_its_true_place(suite):
 
 
 def test_the_error_is_zero_nowhere_and_small_for_people_on_foot(suite):
-    for seen in suite.seen:
+    for seen in suite.perception_results:
         error = seen.error_m[:, seen.kind == int(Kind.PEDESTRIAN)]
         known = error[~np.isnan(error)]
         assert known.size == 0 or (known.min() > 0.01 and known.max() < 0.8)
@@ -138,7 +138,7 @@ def test_a_recall_curve_is_interpolated_over_area():
 
 
 def test_near_agents_are_large_and_far_ones_small(suite):
-    seen = suite.seen[suite.names.index("Bike Approaches Ped")]
+    seen = suite.perception_results[suite.names.index("Bike Approaches Ped")]
     distance = np.hypot(*np.moveaxis(seen.true_m, -1, 0))
     for index in range(2):
         there = seen.present[:, index]
@@ -195,7 +195,7 @@ def test_a_gilbert_channel_against_one_agent_at_a_time():
             else:
                 bad = x >= 1 / 4.0 if bad else x < (1 - r) / (4.0 * r)
             expected.append(bool(bad))
-        assert lost(draw, recall, present, 4.0)[:, agent].tolist() == expected
+        assert missed_detections(draw, recall, present, 4.0)[:, agent].tolist() == expected
 
 
 def test_what_is_absent_is_not_missed():
@@ -214,7 +214,7 @@ def test_trials_draw_the_same_whatever_the_order():
 
 @pytest.mark.parametrize("burst", [None, 5.0])
 def test_trials_of_a_scenario_are_the_same_alone_and_among_others(suite, burst):
-    seen = suite.seen[suite.names.index("Dense Pedestrian Group")]
+    seen = suite.perception_results[suite.names.index("Dense Pedestrian Group")]
     observed = Observed.of("Dense Pedestrian Group", seen, RecallModel())
     together = observed.trials([4, 0, 2], 9, burst)
     for scene, trial in zip(together, (4, 0, 2), strict=True):
@@ -227,8 +227,8 @@ def test_trials_of_a_scenario_are_the_same_alone_and_among_others(suite, burst):
 
 
 def test_without_localisation_error_there_is_none(suite):
-    with_error, without = suite.scenes(True), suite.scenes(False)
-    for a, b, seen in zip(with_error, without, suite.seen, strict=True):
+    with_error, without = suite.detection_sequences(True), suite.detection_sequences(False)
+    for a, b, seen in zip(with_error, without, suite.perception_results, strict=True):
         assert np.array_equal(b.xy_m, seen.true_m, equal_nan=True)
         assert not np.array_equal(a.xy_m, b.xy_m, equal_nan=True)
     selected = CONFIGURATIONS["selected"]

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from bikeped.config import rule_settings
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.perception import SIMULATION_POSE
-from bikeped.lab.simulation.simulate import Scene, rows_of, states, track
+from bikeped.lab.simulation.simulate import DetectionSequence, build_rule_input, states, track
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.lab.simulation.truth import judge_truth
+from bikeped.lab.simulation.truth import compute_ground_truth
 from bikeped.types import State
 
 ALERT = int(State.ALERT)
@@ -56,14 +56,14 @@ def lanes(scenarios):
         there = np.stack([p for _, _, p in sampled], 1)
         codes = {"pedestrian": 0, "cyclist": 1}
         kind = np.array([codes.get(a.kind, 2) for a in scenario.agents], np.int8)
-        scenes.append(Scene(xy, there, kind))
-    return rows_of(track(scenes))
+        scenes.append(DetectionSequence(xy, there, kind))
+    return build_rule_input(track(scenes))
 
 
 def decided(scenarios, configuration="selected"):
     run = lanes(scenarios)
     found = states(run, rule_settings(CONFIGURATIONS[configuration]))
-    return [found[run.lane_slice(i)].tolist() for i in range(len(scenarios))]
+    return [found[run.frame_slice(i)].tolist() for i in range(len(scenarios))]
 
 
 @pytest.mark.parametrize("degrees", [37.0, 90.0, 180.0, -123.4])
@@ -76,7 +76,7 @@ def test_the_mirrored_street_is_as_dangerous_and_decided_alike(suite):
     other = [mirrored(s) for s in suite.scenarios]
     assert decided(other) == decided(suite.scenarios)
     for scenario, truth in zip(other, suite.truths, strict=True):
-        assert judge_truth(scenario).danger.tolist() == truth.danger.tolist()
+        assert compute_ground_truth(scenario).danger.tolist() == truth.danger.tolist()
 
 
 @pytest.mark.parametrize("frames", [1, 17, 300])
@@ -177,7 +177,7 @@ def test_a_pair_that_moves_apart_or_keeps_its_gap_never_alerts(drawn):
     away = receding(*drawn)
     for configuration in (*PAIRWISE, "ttc"):
         assert ALERT not in decided([away], configuration)[0]
-    assert not judge_truth(away).danger.any()
+    assert not compute_ground_truth(away).danger.any()
 
 
 @QUICK

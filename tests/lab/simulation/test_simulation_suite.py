@@ -9,7 +9,14 @@ from bikeped.config import rule_settings
 from bikeped.decision import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator
-from bikeped.lab.simulation.simulate import FPS, SIMULATION_TRACKER, Scene, rows_of, states, track
+from bikeped.lab.simulation.simulate import (
+    FPS,
+    SIMULATION_TRACKER,
+    DetectionSequence,
+    build_rule_input,
+    states,
+    track,
+)
 from bikeped.lab.simulation.suite import CONFIGURATIONS
 from bikeped.tracking import Tracker, predict
 from bikeped.types import GroundPoints, State
@@ -40,16 +47,16 @@ def deployed(scene, rules, orders=(0,)):
 
 
 def simulated(scenes, rules, order=0):
-    run = rows_of(track(scenes), order)
+    run = build_rule_input(track(scenes), order)
     found = states(run, rules)
-    return [found[run.lane_slice(lane)] for lane in range(len(scenes))]
+    return [found[run.frame_slice(lane)] for lane in range(len(scenes))]
 
 
 def variants(suite, index):
     """One scenario as it is asked below: (localisation error, delay) to its scene."""
-    seen = suite.seen[index]
+    seen = suite.perception_results[index]
     return {
-        (error, delay): Scene(
+        (error, delay): DetectionSequence(
             seen.observed_m if error else seen.true_m, seen.present, seen.kind, delay
         )
         for error in (True, False)
@@ -68,10 +75,10 @@ def batch(suite):
     tracked = track(scenes)
     out = {}
     for order in ORDERS:
-        run = rows_of(tracked, order)
+        run = build_rule_input(tracked, order)
         found = states(run, SELECTED)
         for lane, key in enumerate(keys):
-            out[(*key, order)] = found[run.lane_slice(lane)]
+            out[(*key, order)] = found[run.frame_slice(lane)]
     return out
 
 
@@ -85,13 +92,13 @@ def test_lanes_together_equal_the_pole_frame_by_frame(suite, batch, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_monte_carlo_trial_equals_the_pole_frame_by_frame(suite, name):
-    seen = suite.seen[suite.names.index(name)]
+    seen = suite.perception_results[suite.names.index(name)]
     kind = np.broadcast_to(seen.kind, seen.area_px2.shape)
     recall = RecallModel().recall(kind, seen.area_px2)
     scenes = []
     for trial, burst in ((0, None), (1, 5.0)):
         missed = misses(recall, seen.present, trial_generator(0, name, trial), burst)
-        scenes.append(Scene(seen.observed_m, seen.present & ~missed, seen.kind))
+        scenes.append(DetectionSequence(seen.observed_m, seen.present & ~missed, seen.kind))
     for scene, found in zip(scenes, simulated(scenes, SELECTED), strict=True):
         assert found.tolist() == deployed(scene, SELECTED)[0].tolist()
 
@@ -104,7 +111,7 @@ def test_every_configuration_equals_the_pole(suite, configuration):
     for name in names:
         index = suite.names.index(name)
         own = found[suite.truth_frames.scenario == index]
-        expected = deployed(suite.scenes()[index], rules)[0]
+        expected = deployed(suite.detection_sequences()[index], rules)[0]
         assert own.tolist() == expected.tolist(), name
 
 
@@ -176,7 +183,9 @@ def fires(seen, config, f, c, p, k):
 def test_states_by_a_plain_reading_of_the_algorithm(suite, configuration):
     config = CONFIGURATIONS[configuration]
     found = suite.states(config)
-    for index, (scenario, seen) in enumerate(zip(suite.scenarios, suite.seen, strict=True)):
+    for index, (scenario, seen) in enumerate(
+        zip(suite.scenarios, suite.perception_results, strict=True)
+    ):
         if scenario.name == "Dense Pedestrian Group":
             continue  # its people pass nearer to one another than the tracker tells apart
         own = found[suite.truth_frames.scenario == index]

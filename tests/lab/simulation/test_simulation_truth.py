@@ -13,7 +13,7 @@ from bikeped.lab.scenarios.scenario import (
     bundled_folder,
     load_scenarios,
 )
-from bikeped.lab.simulation.truth import TruthSettings, judge_truth, with_ttc_bound
+from bikeped.lab.simulation.truth import GroundTruthSettings, compute_ground_truth, with_ttc_bound
 
 INF = math.inf
 BUNDLED = {s.name: s for s in load_scenarios(bundled_folder())}
@@ -105,7 +105,7 @@ NOTHING = {
 }
 
 
-def frames(scenario, settings=TruthSettings()):  # noqa: B008
+def frames(scenario, settings=GroundTruthSettings()):  # noqa: B008
     profile = settings.braking or scenario.vehicle
     riders = [(a.id, Path(a)) for a in scenario.agents if a.kind in {"cyclist", "motorcycle"}]
     walkers = [(a.id, Path(a)) for a in scenario.agents if a.kind == "pedestrian"]
@@ -138,8 +138,8 @@ def frames(scenario, settings=TruthSettings()):  # noqa: B008
     return out
 
 
-def agree(scenario, settings=TruthSettings()):  # noqa: B008
-    truth, expected = judge_truth(scenario, settings), frames(scenario, settings)
+def agree(scenario, settings=GroundTruthSettings()):  # noqa: B008
+    truth, expected = compute_ground_truth(scenario, settings), frames(scenario, settings)
     assert len(truth.time_s) == len(expected)
     for key in ("danger", "actionable", "imminent", "cyclist", "pedestrian"):
         assert getattr(truth, key).tolist() == [row[key] for row in expected], key
@@ -165,13 +165,13 @@ def test_every_frame_and_field_of_the_24(name):
 @pytest.mark.parametrize(
     "settings",
     [
-        TruthSettings(cpa_radius_m=3.0),
-        TruthSettings(cpa_radius_m=7.0, stopping_margin=1.0),
-        TruthSettings(stopping_margin=0.6),
-        with_ttc_bound(TruthSettings(), 2.0),
-        with_ttc_bound(TruthSettings(), 4.0),
-        TruthSettings(braking="aashto"),
-        TruthSettings(braking="ebike"),
+        GroundTruthSettings(cpa_radius_m=3.0),
+        GroundTruthSettings(cpa_radius_m=7.0, stopping_margin=1.0),
+        GroundTruthSettings(stopping_margin=0.6),
+        with_ttc_bound(GroundTruthSettings(), 2.0),
+        with_ttc_bound(GroundTruthSettings(), 4.0),
+        GroundTruthSettings(braking="aashto"),
+        GroundTruthSettings(braking="ebike"),
     ],
 )
 def test_free_thresholds_and_braking_profiles(settings):
@@ -253,4 +253,4 @@ def test_no_pair_no_danger():
 @pytest.mark.parametrize("seconds", [0, -1, math.inf, math.nan])
 def test_a_ttc_bound_is_seconds(seconds):
     with pytest.raises(ValueError, match="ttc bound"):
-        with_ttc_bound(TruthSettings(), seconds)
+        with_ttc_bound(GroundTruthSettings(), seconds)

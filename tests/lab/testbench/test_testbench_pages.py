@@ -105,11 +105,14 @@ def test_trials_agree_with_monte_carlo(work, suite, recall, mode):
 def test_a_fixed_share_of_everybody_is_seen(work):
     asked = bench("Bike Approaches Ped", perception={"recall": "fixed", "recall_value": 1.0})
     all_seen = work.only(asked)
-    assert all_seen.scenes_seen[0].detected.tolist() == all_seen.seen[0].present.tolist()
+    assert (
+        all_seen.shown_detections[0].detected.tolist()
+        == all_seen.perception_results[0].present.tolist()
+    )
     half = work.only(
         bench("Bike Approaches Ped", perception={"recall": "fixed", "recall_value": 0.5})
     )
-    share = half.scenes_seen[0].detected.sum() / half.seen[0].present.sum()
+    share = half.shown_detections[0].detected.sum() / half.perception_results[0].present.sum()
     assert 0.4 < share < 0.6
     play = playback(half, 0, {"": BASE.decision})
     assert sum(play["agents"][0]["missed"]) > 50
@@ -211,7 +214,7 @@ def test_what_was_kept_is_not_mistaken_for_something_else(work):
 
     def figures(workbench, one):
         suite = workbench.whole(one)
-        tracks = hashlib.sha256(suite.run.rows.xy_m.tobytes()).hexdigest()
+        tracks = hashlib.sha256(suite.rule_input.rows.xy_m.tobytes()).hexdigest()
         return tracks, suite.truths[0].danger.sum(), repr(suite.measure(one.decision).as_dict())
 
     fresh = [figures(BenchRunner(LOADED, few), one) for one in asked]
