@@ -69,7 +69,7 @@ DPI = 160
 _TITLE_PT, _CAPTION_PT, _MARGIN_IN = 11.5, 8.5, 0.12
 
 
-class Sheet:
+class FigureSheet:
     """One figure: title on top, panels, caption below. Use as a context manager around drawing.
 
     `width` and `height` in inches are those of the panels with their labels; title and caption
@@ -116,7 +116,7 @@ class Sheet:
             left,
             1 - _MARGIN_IN / total,
             # Names of scenarios are anybody's: a dollar sign is not mathematics.
-            plain("\n".join(title_lines)),
+            escape_dollars("\n".join(title_lines)),
             fontsize=_TITLE_PT,
             fontweight="bold",
             va="top",
@@ -125,7 +125,7 @@ class Sheet:
         self.figure.text(
             left,
             _MARGIN_IN / total,
-            plain("\n".join(lines)),
+            escape_dollars("\n".join(lines)),
             fontsize=_CAPTION_PT,
             va="bottom",
             color="#3d3d3d",
@@ -134,7 +134,7 @@ class Sheet:
         grid = self.figure.subplots(rows, columns, squeeze=False, **subplots)
         self.axes: list[Axes] = list(grid.ravel())
 
-    def __enter__(self) -> Sheet:
+    def __enter__(self) -> FigureSheet:
         return self
 
     def __exit__(self, *problem: object) -> None:
@@ -176,22 +176,22 @@ class Sheet:
         return paths
 
 
-def plain(text: str) -> str:
+def escape_dollars(text: str) -> str:
     """Text as it is: matplotlib takes what stands between two dollar signs for mathematics."""
     return text.replace("$", r"\$")
 
 
-def reals(values: Iterable[float | None], scale: float = 1.0) -> FloatArray:
+def to_floats(values: Iterable[float | None], scale: float = 1.0) -> FloatArray:
     """Figures from JSON as an array; null is NaN, which leaves a gap."""
     return np.asarray([math.nan if v is None else scale * v for v in values], dtype=np.float64)
 
 
-def percents(values: Iterable[float | None]) -> FloatArray:
+def to_percents(values: Iterable[float | None]) -> FloatArray:
     """Shares from JSON in per cent."""
-    return reals(values, 100.0)
+    return to_floats(values, 100.0)
 
 
-def stem_of(name: str) -> str:
+def file_stem(name: str) -> str:
     """A file name from a scenario's name, which may hold anything."""
     words = "".join(c.lower() if c.isascii() and c.isalnum() else " " for c in name).split()
     return "-".join(words)[:60] or "scenario"

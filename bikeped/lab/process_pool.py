@@ -29,8 +29,8 @@ _ONE_THREAD = (
 _SIGINT = {signal.SIGINT}
 
 
-class Workers:
-    """What `workers` yields: `submit` as an executor has it."""
+class WorkerPool:
+    """What `worker_pool` yields: `submit` as an executor has it."""
 
     def __init__(self, executor: ProcessPoolExecutor) -> None:
         self._executor = executor
@@ -46,7 +46,7 @@ class Workers:
 
 
 @contextlib.contextmanager
-def workers(processes: int) -> Iterator[Workers]:
+def worker_pool(processes: int) -> Iterator[WorkerPool]:
     """Processes started afresh: a fork would copy the locks of our threads."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
@@ -54,7 +54,7 @@ def workers(processes: int) -> Iterator[Workers]:
         processes, multiprocessing.get_context("spawn"), initializer=_begin
     )
     try:
-        yield Workers(executor)
+        yield WorkerPool(executor)
     finally:
         executor.shutdown(cancel_futures=True)
         for name, value in before.items():

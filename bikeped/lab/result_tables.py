@@ -8,17 +8,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-Cell = str | float | int | None
+CellValue = str | float | int | None
 
 
 @dataclass(frozen=True)
-class Table:
+class ResultTable:
     """One table: `name` is its file name, `rows` hold plain values (None: no figure)."""
 
     name: str
     title: str
     columns: tuple[str, ...]
-    rows: Sequence[tuple[Cell, ...]]
+    rows: Sequence[tuple[CellValue, ...]]
     note: str = ""
 
     def csv(self) -> str:
@@ -34,9 +34,9 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Result:
+class ExperimentResult:
     """One experiment's outcome: `data` is plain JSON, `tables` say the same for people."""
 
     name: str
     data: dict[str, Any]
-    tables: tuple[Table, ...] = field(default=())
+    tables: tuple[ResultTable, ...] = field(default=())

@@ -66,14 +66,14 @@ def _searches(figures: Figures, suite: Suite, loaded: LoadedConfig, one_pass_s: 
     """
     from bikeped.cores import cores
     from bikeped.lab.experiments import optimizer
-    from bikeped.lab.experiments.reproduce import Settings, reproduce
+    from bikeped.lab.experiments.reproduce import ReproduceSettings, reproduce
 
     count = optimizer.evaluations()
     began = time.perf_counter()
     optimizer.optimize(suite, loaded.config.decision)
     took = time.perf_counter() - began
     figures.add(f"optimise, {count} evaluations", took, count * one_pass_s, "s", "60")
-    trials = Settings().trials
+    trials = ReproduceSettings().trials
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         reproduce(suite, loaded, Path(folder), processes=cores())

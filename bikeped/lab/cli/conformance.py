@@ -61,12 +61,12 @@ def run(
     audit_path: Path | None,
 ) -> None:
     """Every scenario under the configuration: states, misses, false alerts, warning budgets."""
-    from bikeped.lab.experiments.deterministic import one_scenario, run_table
+    from bikeped.lab.experiments.deterministic import run_table, select_scenario
     from bikeped.lab.governance.audit_records import write_audit
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     if name is not None:
-        suite = one_scenario(suite, name)
+        suite = select_scenario(suite, name)
     if audit_path is not None:
         write_audit(audit_path, suite, loaded.config.decision, loaded, seed or 0)
     emit(run_table(suite, loaded.config.decision), suite, loaded, seed or 0, json_path)
@@ -136,13 +136,13 @@ def truth(
 ) -> None:
     """Do the figures hang on the ground truth's thresholds, or on how cyclists brake?"""
     from bikeped.lab.experiments.deterministic import braking_profiles, truth_sensitivity
-    from bikeped.lab.result_tables import Result
+    from bikeped.lab.result_tables import ExperimentResult
 
     loaded, suite = begin(config_path, overrides, scenarios_dir)
     decision = loaded.config.decision
     thresholds, braking = truth_sensitivity(suite, decision), braking_profiles(suite, decision)
     data = {**thresholds.data, "braking": braking.data}
-    result = Result("truth", data, (*thresholds.tables, *braking.tables))
+    result = ExperimentResult("truth", data, (*thresholds.tables, *braking.tables))
     emit(result, suite, loaded, seed or 0, json_path)
 
 
@@ -222,7 +222,7 @@ def latency(
     else:
         require("scipy")
         workers = processes or cores()
-        jobs = mc.plan_jobs(1, trials)
+        jobs = mc.trial_jobs(1, trials)
         with progress_bar("trials", jobs) as progress:
             result = late.sweep_with_loss(
                 suite,
@@ -361,15 +361,15 @@ def reproduce(
     """All experiments with every table and figure; resumes where it was interrupted."""
     require("scipy")
     from bikeped.lab.experiments import reproduce as whole
-    from bikeped.lab.experiments.deterministic import shown
+    from bikeped.lab.experiments.deterministic import metric_cells
     from bikeped.lab.experiments.montecarlo import load_recall_curve
-    from bikeped.lab.result_tables import Table
+    from bikeped.lab.result_tables import ResultTable
 
     if not no_figures:
         require("matplotlib")
     curve = None if curve_path is None else load_recall_curve(curve_path)
     loaded, suite = begin(config_path, overrides, scenarios_dir)
-    settings = whole.Settings(trials=trials, seed=seed or 0, burst=burst, curve=curve)
+    settings = whole.ReproduceSettings(trials=trials, seed=seed or 0, burst=burst, curve=curve)
     with progress_bar("experiments", len(whole.EXPERIMENTS) + 1) as progress:
         found = whole.reproduce(
             suite, loaded, out, settings, processes or cores(), not no_figures, progress
@@ -391,8 +391,8 @@ def reproduce(
     screen = console(json_path)
     compared = data["compare"]["configurations"]
     columns = next(r for r in found.results if r.name == "compare").tables[0].columns
-    rows = [(name, *shown(metrics)) for name, metrics in compared.items()]
-    print_table(screen, Table("compare", "Configurations", columns, rows))
+    rows = [(name, *metric_cells(metrics)) for name, metrics in compared.items()]
+    print_table(screen, ResultTable("compare", "Configurations", columns, rows))
     screen.print(
         f"{len(found.results)} experiments ({len(found.reused)} were there already), "
         f"{len(found.figures)} figure files in {escape(str(out))}"

@@ -56,14 +56,14 @@ def gate(
     a gate does not hold.
     """
     from bikeped.config.provenance import decision_hash
-    from bikeped.lab.governance.gates import all_hold, check
+    from bikeped.lab.governance.gates import all_hold, check_gates
 
     rest, own = _split(overrides)
     decision = load_decision(candidate, own)
     loaded = load_config(config_path, rest)
     suite = load_suite(loaded, scenarios_dir)
     metrics = suite.measure(decision)
-    gates = check(metrics)
+    gates = check_gates(metrics)
     if json_path is not None:
         write_json(
             {
@@ -108,7 +108,7 @@ def promote(
     FILE.provenance.json, which `bikeped run` checks. A candidate that fails a gate is refused:
     nothing is written, the command ends with 1.
     """
-    from bikeped.lab.governance.gates import all_hold, check
+    from bikeped.lab.governance.gates import all_hold, check_gates
     from bikeped.lab.governance.promote import promote as write
     from bikeped.lab.governance.promote import provenance_record
 
@@ -123,7 +123,7 @@ def promote(
     decision = load_decision(candidate, own)
     suite = load_suite(loaded, scenarios_dir)
     metrics = suite.measure(decision)
-    gates = check(metrics)
+    gates = check_gates(metrics)
     files = [("candidate", candidate)] + ([("trace", trace)] if trace is not None else [])
     record = provenance_record(suite, decision, metrics, loaded, files)
     print_gates(f"{candidate} on {count(len(suite.scenarios))}", gates, json_path)
@@ -180,7 +180,7 @@ def contest(
     Before is the configuration as it is (-c) on the suite as it is; after is with --set, --bound,
     --truth and --scenario. Needs no camera, no model and no access to the pole.
     """
-    from bikeped.lab.governance import contest as contesting
+    from bikeped.lab.governance import what_if
     from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.lab.simulation.suite import DEFAULT_GROUND_TRUTH
 
@@ -196,11 +196,11 @@ def contest(
     same_camera = not _split(overrides)[0]
     after = before if same_camera else load_suite(other, scenarios_dir)
     if added:
-        after = contesting.with_scenarios(after, [load_scenario(path) for path in added])
+        after = what_if.with_scenarios(after, [load_scenario(path) for path in added])
     if truth:
-        after = after.with_truth(contesting.parse_truth(DEFAULT_GROUND_TRUTH, truth))
-    decision = contesting.apply_bounds(other.config.decision, bound)
-    found = contesting.contest(before, loaded.config.decision, after, decision)
+        after = after.with_truth(what_if.parse_truth(DEFAULT_GROUND_TRUTH, truth))
+    decision = what_if.apply_bounds(other.config.decision, bound)
+    found = what_if.compare_variants(before, loaded.config.decision, after, decision)
     command = _command_line(config_path, overrides, scenarios_dir, added, truth, bound)
     if json_path is not None:
         write_json({"command": command, **found.as_dict()}, json_path)
@@ -227,10 +227,10 @@ def register(
     json_path: str | None,
 ) -> int:
     """Write the residual-risk register of the configuration's decision."""
-    from bikeped.lab.governance.register import build
+    from bikeped.lab.governance.register import build_register
 
     loaded = load_config(config_path, overrides)
-    found = build(load_suite(loaded, scenarios_dir), loaded.config.decision)
+    found = build_register(load_suite(loaded, scenarios_dir), loaded.config.decision)
     if json_path is not None:
         write_json({"config_hash": loaded.hash, **found.as_dict()}, json_path)
     if out is not None:

@@ -63,11 +63,11 @@ def command(
     """
     from dataclasses import replace
 
-    from bikeped.lab.endtoend.ablation import ladder
-    from bikeped.lab.endtoend.measures import sights
-    from bikeped.lab.endtoend.report import Drawing, pixels_result, verdict
+    from bikeped.lab.endtoend.ablation import run_ablation
+    from bikeped.lab.endtoend.measures import collect_observations
+    from bikeped.lab.endtoend.report import DrawingSettings, end_to_end_result, verdict
     from bikeped.lab.endtoend.run import run_all
-    from bikeped.lab.experiments.deterministic import one_scenario
+    from bikeped.lab.experiments.deterministic import select_scenario
     from bikeped.lab.rendering import Conditions
 
     width, height = _size(size)
@@ -83,17 +83,17 @@ def command(
         if len(set(names)) < len(names):
             raise BikepedError("--scenario: names a scenario twice, which would count it twice")
         suite = replace(
-            suite, scenarios=tuple(s for n in names for s in one_scenario(suite, n).scenarios)
+            suite, scenarios=tuple(s for n in names for s in select_scenario(suite, n).scenarios)
         )
     conditions = Conditions(seed=seed or 0, light=light, weather=weather, place=place)
     with progress_bar("scenarios", len(suite.scenarios)) as progress:
         runs = run_all(
             loaded, suite.scenarios, conditions, (width, height), processes or cores(), progress
         )
-    rungs = ladder(suite, runs, loaded, loaded.config.decision)
-    drawing = Drawing(width, height, light, weather, place, seed or 0)
-    result = pixels_result(
-        suite, runs, rungs, sights(runs, suite.perception_results, loaded), drawing
+    rungs = run_ablation(suite, runs, loaded, loaded.config.decision)
+    drawing = DrawingSettings(width, height, light, weather, place, seed or 0)
+    result = end_to_end_result(
+        suite, runs, rungs, collect_observations(runs, suite.perception_results, loaded), drawing
     )
     if figures is not None:
         from bikeped.lab.endtoend.figure import draw_pixels

@@ -15,7 +15,7 @@ from bikeped.cli.common import FiniteRange, config_options, console, json_option
 from bikeped.config import LoadedConfig, load_config
 
 if TYPE_CHECKING:
-    from bikeped.lab.result_tables import Cell, Result, Table
+    from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
     from bikeped.lab.simulation.suite import Suite
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -80,12 +80,12 @@ burst_option = click.option(
 )
 
 
-def print_table(screen: Console, table: Table) -> None:
+def print_table(screen: Console, table: ResultTable) -> None:
     """A table for people."""
     screen.print(rich_table(table))
 
 
-def rich_table(table: Table) -> RichTable:
+def rich_table(table: ResultTable) -> RichTable:
     """A table for a terminal: per cent with one decimal, seconds with two."""
     drawn = RichTable(
         title=escape(table.title),
@@ -103,7 +103,7 @@ def rich_table(table: Table) -> RichTable:
     return drawn
 
 
-def cell_text(cell: Cell, column: str) -> str:
+def cell_text(cell: CellValue, column: str) -> str:
     """One figure as the column's name asks for it; a dash where there is none."""
     if cell is None:
         return "-"
@@ -133,7 +133,7 @@ def load_suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
 
 
 def emit(
-    result: Result, suite: Suite, loaded: LoadedConfig, seed: int, json_path: str | None
+    result: ExperimentResult, suite: Suite, loaded: LoadedConfig, seed: int, json_path: str | None
 ) -> None:
     """JSON where it is asked for, tables for people unless standard output is JSON's."""
     if json_path is not None:
@@ -148,6 +148,6 @@ def emit(
 
 def stamp(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
     """What every JSON begins with: where its figures come from."""
-    from bikeped.lab.experiments.deterministic import provenance
+    from bikeped.lab.experiments.deterministic import result_provenance
 
-    return provenance(suite, loaded, seed)
+    return result_provenance(suite, loaded, seed)

@@ -24,11 +24,15 @@ def print_gates(title: str, gates: list[Gate], json_path: str | None) -> None:
     for column in ("Gate", "Required", "Measured", "Holds"):
         table.add_column(column)
     for g in gates:
-        table.add_row(g.name, g.rule, g.say(g.measured), "yes" if g.holds else "[bold]NO[/bold]")
+        table.add_row(
+            g.name, g.rule, g.format_value(g.measured), "yes" if g.holds else "[bold]NO[/bold]"
+        )
     out = console(json_path)
     out.print(table)
     failed = [
-        f"{g.name.lower()} {g.say(g.measured)}, required {g.rule}" for g in gates if not g.holds
+        f"{g.name.lower()} {g.format_value(g.measured)}, required {g.rule}"
+        for g in gates
+        if not g.holds
     ]
     out.print("Fails: " + "; ".join(failed) if failed else "All gates hold.")
 

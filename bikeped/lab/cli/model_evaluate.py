@@ -21,7 +21,7 @@ from bikeped.errors import BikepedError, require
 from bikeped.lab.cli.conformance_shared import print_table
 
 if TYPE_CHECKING:
-    from bikeped.lab.result_tables import Cell, Table
+    from bikeped.lab.result_tables import CellValue, ResultTable
     from bikeped.lab.training.evaluate import Evaluation
     from bikeped.lab.training.measures import Row
 
@@ -144,9 +144,9 @@ def command(
     return 0
 
 
-def tables(result: Evaluation) -> list[Table]:
+def tables(result: Evaluation) -> list[ResultTable]:
     """The paper's detection table, by size, and by class where there is more than one."""
-    from bikeped.lab.result_tables import Table
+    from bikeped.lab.result_tables import ResultTable
     from bikeped.lab.training.evaluation_figures import evaluation_rows
 
     rows = [evaluation_rows(score) for score in result.scores]
@@ -156,8 +156,8 @@ def tables(result: Evaluation) -> list[Table]:
     if unknown:
         some = ", ".join(unknown[:6]) + (", ..." if len(unknown) > 6 else "")
         note += f"; not known to every model and so left out of the classes: {some}"
-    main = Table("detection", "detection", *_compared(result, rows), note)
-    sizes = Table(
+    main = ResultTable("detection", "detection", *_compared(result, rows), note)
+    sizes = ResultTable(
         "by_size",
         "recall by area at the network's input: small < 32^2, medium < 96^2, large",
         ("", *(f"{s.label} {n}" for s in result.scores for n in ("small", "medium", "large"))),
@@ -176,17 +176,17 @@ def tables(result: Evaluation) -> list[Table]:
             if score.classes is not None
         ]
         if len(by_class[0]) > 1:
-            found.append(Table("classes", "by class", *_compared(result, by_class)))
+            found.append(ResultTable("classes", "by class", *_compared(result, by_class)))
     return found
 
 
-def _alarms(result: Evaluation) -> Table:
+def _alarms(result: Evaluation) -> ResultTable:
     """False alarms of what is deployed."""
-    from bikeped.lab.result_tables import Table
+    from bikeped.lab.result_tables import ResultTable
     from bikeped.lab.training.evaluate import KIND_NAMES
 
     pictures = result.data["images"]
-    return Table(
+    return ResultTable(
         "false",
         "as deployed: false boxes per 100 pictures (IoU below 0.50 with anything)",
         ("", *KIND_NAMES),
@@ -197,18 +197,18 @@ def _alarms(result: Evaluation) -> Table:
     )
 
 
-def _distances(result: Evaluation) -> Table:
+def _distances(result: Evaluation) -> ResultTable:
     """Recall against distance, where the data tell it."""
-    from bikeped.lab.result_tables import Table
+    from bikeped.lab.result_tables import ResultTable
 
     first = result.scores[0].by_distance
-    lines: list[tuple[Cell, ...]] = []
+    lines: list[tuple[CellValue, ...]] = []
     for kind, rows in first.items():
         for index, row in enumerate(rows):
             end = "" if row["to_m"] is None else f"{row['to_m']:g}"
             own = [_three(s.by_distance[kind][index]["recall50"]) for s in result.scores]
             lines.append((kind, f"{row['from_m']:g} to {end}".strip(), row["objects"], *own))
-    return Table(
+    return ResultTable(
         "distance",
         "as deployed: recall at IoU 0.50 by distance",
         ("", "distance, m", "objects", *(score.label for score in result.scores)),
@@ -218,14 +218,14 @@ def _distances(result: Evaluation) -> Table:
 
 def _compared(
     result: Evaluation, rows: list[list[tuple[str, Row]]]
-) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
+) -> tuple[tuple[str, ...], list[tuple[CellValue, ...]]]:
     """Columns and rows: AP, AP50 and recall of each model, and AP against the first model's."""
     columns = ["", "objects"]
     for number, score in enumerate(result.scores):
         columns += [f"{score.label} AP", "AP50", "recall"] + (["AP ratio"] if number else [])
-    lines: list[tuple[Cell, ...]] = []
+    lines: list[tuple[CellValue, ...]] = []
     for index, (name, first) in enumerate(rows[0]):
-        line: list[Cell] = [name, first.objects]
+        line: list[CellValue] = [name, first.objects]
         for number, own in enumerate(rows):
             row = own[index][1]
             line += [_three(row.ap), _three(row.ap50), _three(row.ar)]

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import DecisionConfig, LoadedConfig
-from bikeped.lab.endtoend.matching import MIN_VISIBLE, match
-from bikeped.lab.endtoend.run import PixelRun
+from bikeped.lab.endtoend.matching import MIN_VISIBLE, match_detections
+from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.simulation.metrics import Metrics, measure
 from bikeped.lab.simulation.perception import PerceptionResult
@@ -27,7 +27,7 @@ States = npt.NDArray[np.int8]
 
 
 @dataclass(frozen=True)
-class Rung:
+class AblationStep:
     """One step: its name, what it adds to the one before, and the figures with it."""
 
     name: str
@@ -36,19 +36,19 @@ class Rung:
     metrics: Metrics
 
 
-def ladder(
-    suite: Suite, runs: Sequence[PixelRun], loaded: LoadedConfig, decision: DecisionConfig
-) -> list[Rung]:
+def run_ablation(
+    suite: Suite, runs: Sequence[EndToEndRun], loaded: LoadedConfig, decision: DecisionConfig
+) -> list[AblationStep]:
     """The rungs from scripted positions to the deployed loop, over all scenarios of `suite`."""
     judge = Judge(loaded, riders_whole=all(run.riders_whole for run in runs))
     seen = suite.perception_results
 
-    def points(present: Callable[[PixelRun, int, int], bool]) -> States:
+    def points(present: Callable[[EndToEndRun, int, int], bool]) -> States:
         return np.concatenate(
             [_judge_points(judge, s, run, present) for s, run in zip(seen, runs, strict=True)]
         )
 
-    def boxes(of: Callable[[PixelRun, int], Detections]) -> States:
+    def boxes(of: Callable[[EndToEndRun, int], Detections]) -> States:
         return np.concatenate([_judge_boxes(judge, run, of) for run in runs])
 
     steps: list[tuple[str, str, States]] = [
@@ -67,7 +67,7 @@ def ladder(
         ),
     ]
     return [
-        Rung(name, adds, states, measure(suite.truth_frames, states))
+        AblationStep(name, adds, states, measure(suite.truth_frames, states))
         for name, adds, states in steps
     ]
 
@@ -75,8 +75,8 @@ def ladder(
 def _judge_points(
     judge: Judge,
     seen: PerceptionResult,
-    run: PixelRun,
-    present: Callable[[PixelRun, int, int], bool],
+    run: EndToEndRun,
+    present: Callable[[EndToEndRun, int, int], bool],
 ) -> States:
     judge.reset()
     states = []
@@ -94,7 +94,9 @@ def _judge_points(
     return np.asarray(states, np.int8)
 
 
-def _judge_boxes(judge: Judge, run: PixelRun, of: Callable[[PixelRun, int], Detections]) -> States:
+def _judge_boxes(
+    judge: Judge, run: EndToEndRun, of: Callable[[EndToEndRun, int], Detections]
+) -> States:
     judge.reset()
     return np.asarray(
         [
@@ -105,11 +107,11 @@ def _judge_boxes(judge: Judge, run: PixelRun, of: Callable[[PixelRun, int], Dete
     )
 
 
-def _always(run: PixelRun, frame: int, agent: int) -> bool:
+def _always(run: EndToEndRun, frame: int, agent: int) -> bool:
     return True
 
 
-def _in_picture(run: PixelRun, frame: int, agent: int) -> bool:
+def _in_picture(run: EndToEndRun, frame: int, agent: int) -> bool:
     return any(o.id == agent for o in run.objects[frame])
 
 
@@ -123,28 +125,28 @@ def _exact(objects: Sequence[DrawnObject], whole: bool) -> Detections:
     )
 
 
-def _whole(run: PixelRun, frame: int) -> Detections:
+def _whole(run: EndToEndRun, frame: int) -> Detections:
     return _exact(run.objects[frame], whole=True)
 
 
-def _visible(run: PixelRun, frame: int) -> Detections:
+def _visible(run: EndToEndRun, frame: int) -> Detections:
     return _exact([o for o in run.objects[frame] if o.visible >= MIN_VISIBLE], whole=False)
 
 
-def _found_exact(run: PixelRun, frame: int) -> Detections:
+def _found_exact(run: EndToEndRun, frame: int) -> Detections:
     objects = run.objects[frame]
-    found = match(run.detections[frame], objects).found
+    found = match_detections(run.detections[frame], objects).found
     return _exact([o for o, d in zip(objects, found, strict=True) if d >= 0], whole=False)
 
 
-def _found(run: PixelRun, frame: int) -> Detections:
+def _found(run: EndToEndRun, frame: int) -> Detections:
     detections = run.detections[frame]
-    return detections.take(match(detections, run.objects[frame]).object >= 0)
+    return detections.take(match_detections(detections, run.objects[frame]).object >= 0)
 
 
-def _found_true_kind(run: PixelRun, frame: int) -> Detections:
+def _found_true_kind(run: EndToEndRun, frame: int) -> Detections:
     detections, objects = run.detections[frame], run.objects[frame]
-    which = match(detections, objects).object
+    which = match_detections(detections, objects).object
     kept = detections.take(which >= 0)
     kind = np.asarray([int(objects[o].label) for o in which[which >= 0]], np.int8)
     return Detections(kind, kept.confidence, kept.box_px)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bikeped.lab.plotting import GREY, SERIES, Sheet, percents, reals
+from bikeped.lab.plotting import GREY, SERIES, FigureSheet, to_floats, to_percents
 from bikeped.types import Kind
 
 
@@ -21,7 +21,9 @@ def draw_pixels(data: Mapping[str, Any], folder: Path) -> list[Path]:
         f"{drawing['light']}, {drawing['weather']}; {data['frames']} frames; {data['detector']}."
     )
     title = "From the scripted run to pixels"
-    with Sheet(title, caption, 10.0, 3.4, columns=3, legend_rows=0, width_ratios=(1.3, 1, 1)) as s:
+    with FigureSheet(
+        title, caption, 10.0, 3.4, columns=3, legend_rows=0, width_ratios=(1.3, 1, 1)
+    ) as s:
         stages, recall, places = s.axes
         rows = data["stages"]
         names = [row["name"] for row in rows]
@@ -29,7 +31,7 @@ def draw_pixels(data: Mapping[str, Any], folder: Path) -> list[Path]:
         for key, (colour, marker, dash) in zip(
             ("sensitivity", "specificity"), SERIES, strict=False
         ):
-            values = percents(row[key] for row in rows)
+            values = to_percents(row[key] for row in rows)
             stages.plot(at, values, color=colour, marker=marker, linestyle=dash, label=key)
         stages.set_xticks(list(at), names, rotation=35, ha="right")
         stages.set(ylabel="%", title="Sensitivity and specificity")
@@ -40,7 +42,7 @@ def draw_pixels(data: Mapping[str, Any], folder: Path) -> list[Path]:
             ]
             recall.plot(
                 _middles(cells),
-                percents(r["recall"] for r in cells),
+                to_percents(r["recall"] for r in cells),
                 color=colour,
                 marker=marker,
                 linestyle=dash,
@@ -49,7 +51,7 @@ def draw_pixels(data: Mapping[str, Any], folder: Path) -> list[Path]:
             cells = [r for r in data["localisation"] if r["kind"] == kind.label and r["found"]]
             places.plot(
                 _middles(cells),
-                reals(r["mean_m"] for r in cells),
+                to_floats(r["mean_m"] for r in cells),
                 color=colour,
                 marker=marker,
                 linestyle=dash,
@@ -57,7 +59,7 @@ def draw_pixels(data: Mapping[str, Any], folder: Path) -> list[Path]:
             )
             places.plot(
                 _middles(cells),
-                reals(r["box_model_mean_m"] for r in cells),
+                to_floats(r["box_model_mean_m"] for r in cells),
                 color=colour,
                 linewidth=0.7,
             )

@@ -18,14 +18,14 @@ MIN_VISIBLE = 0.25
 
 
 @dataclass(frozen=True)
-class Matched:
+class DetectionMatch:
     """`object` [d]: index of the object that each detection is, or -1; `found` [o] the reverse."""
 
     object: IntArray
     found: IntArray
 
 
-def match(detections: Detections, objects: Sequence[DrawnObject]) -> Matched:
+def match_detections(detections: Detections, objects: Sequence[DrawnObject]) -> DetectionMatch:
     """Greedy by overlap; a detection of the right kind comes before any of a wrong one."""
     of_detection = np.full(len(detections), -1)
     of_object = np.full(len(objects), -1)
@@ -38,7 +38,7 @@ def match(detections: Detections, objects: Sequence[DrawnObject]) -> Matched:
             for d, o in _best_first(np.where(mask, overlap, 0.0)):
                 if of_detection[d] < 0 and of_object[o] < 0:
                     of_detection[d], of_object[o] = o, d
-    return Matched(of_detection, of_object)
+    return DetectionMatch(of_detection, of_object)
 
 
 def _best_first(overlap: FloatArray) -> list[tuple[int, int]]:

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from bikeped.config import LoadedConfig
-from bikeped.lab.endtoend.matching import MIN_VISIBLE, match
-from bikeped.lab.endtoend.run import PixelRun
+from bikeped.lab.endtoend.matching import MIN_VISIBLE, match_detections
+from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.simulation.perception import PerceptionResult
 from bikeped.pipeline.ground_mapper import Viewpoint
 from bikeped.types import Detections, FloatArray, Kind
@@ -20,7 +20,7 @@ RINGS_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0)
 
 
 @dataclass(frozen=True)
-class Sights:
+class Observations:
     """Every drawn object of every frame that could be seen: arrays [n].
 
     `found_m` is how far from its true place the detector's box puts it on the ground, `exact_m` its
@@ -39,9 +39,9 @@ class Sights:
     model_m: FloatArray
 
 
-def sights(
-    runs: Sequence[PixelRun], seen: Sequence[PerceptionResult], loaded: LoadedConfig
-) -> Sights:
+def collect_observations(
+    runs: Sequence[EndToEndRun], seen: Sequence[PerceptionResult], loaded: LoadedConfig
+) -> Observations:
     """What there was to see in `runs`, and what became of it."""
     viewpoint = Viewpoint(loaded)
     rows: list[tuple[float, ...]] = []
@@ -54,7 +54,7 @@ def sights(
             zip(run.objects, run.detections, strict=True)
         ):
             frames += 1
-            matched = match(detections, objects)
+            matched = match_detections(detections, objects)
             for kind in detections.kind[matched.object < 0].tolist():
                 false[Kind(kind)] += 1
             found_xy = _on_ground(viewpoint, framing.frame_to_crop(detections.bottom_centre_px()))
@@ -80,7 +80,7 @@ def sights(
                     )
                 )
     table = np.asarray(rows, np.float64).reshape(-1, 7)
-    return Sights(frames, false, *table.T)
+    return Observations(frames, false, *table.T)
 
 
 def _on_ground(viewpoint: Viewpoint, crop_px: FloatArray) -> FloatArray:
@@ -89,7 +89,7 @@ def _on_ground(viewpoint: Viewpoint, crop_px: FloatArray) -> FloatArray:
     return np.asarray(np.where(valid[:, None], xy, np.nan))
 
 
-def recall_rows(all_sights: Sights) -> list[dict[str, float | str | int | None]]:
+def recall_rows(all_sights: Observations) -> list[dict[str, float | str | int | None]]:
     """Recall by kind and distance ring: `seen` object frames, the share `found` and `recall`
     (found as what it is)."""
     rows: list[dict[str, float | str | int | None]] = []
@@ -108,7 +108,7 @@ def recall_rows(all_sights: Sights) -> list[dict[str, float | str | int | None]]
     return rows
 
 
-def localisation_rows(all_sights: Sights) -> list[dict[str, float | str | int | None]]:
+def localisation_rows(all_sights: Observations) -> list[dict[str, float | str | int | None]]:
     """Localisation error by kind and ring: mean and 90th percentile of the found boxes, and beside
     them, over the same objects, the exact boxes' and the simulation's box model's means, metres."""
     rows: list[dict[str, float | str | int | None]] = []
@@ -136,7 +136,7 @@ def _mean(values: FloatArray) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def _cells(all_sights: Sights) -> list[tuple[Kind, float, float, np.ndarray]]:  # type: ignore[type-arg]
+def _cells(all_sights: Observations) -> list[tuple[Kind, float, float, np.ndarray]]:  # type: ignore[type-arg]
     return [
         (
             kind,

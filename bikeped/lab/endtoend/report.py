@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bikeped.lab.endtoend.ablation import Rung
+from bikeped.lab.endtoend.ablation import AblationStep
 from bikeped.lab.endtoend.matching import MIN_IOU, MIN_VISIBLE
-from bikeped.lab.endtoend.measures import Sights, localisation_rows, recall_rows
-from bikeped.lab.endtoend.run import PixelRun
-from bikeped.lab.experiments.deterministic import SHOWN_COLUMNS, percent, shown
-from bikeped.lab.result_tables import Cell, Result, Table
+from bikeped.lab.endtoend.measures import Observations, localisation_rows, recall_rows
+from bikeped.lab.endtoend.run import EndToEndRun
+from bikeped.lab.experiments.deterministic import METRIC_COLUMNS, metric_cells, rounded_percent
+from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
 from bikeped.lab.simulation.metrics import Metrics, finite_or_none
 from bikeped.lab.simulation.perception import error_table
 from bikeped.lab.simulation.suite import Suite
@@ -23,7 +23,7 @@ GOAL = 0.03
 
 
 @dataclass(frozen=True)
-class Drawing:
+class DrawingSettings:
     """How the scenarios were drawn, for the record."""
 
     width: int
@@ -34,13 +34,17 @@ class Drawing:
     seed: int
 
 
-def pixels_result(
-    suite: Suite, runs: Sequence[PixelRun], rungs: Sequence[Rung], seen: Sights, drawing: Drawing
-) -> Result:
+def end_to_end_result(
+    suite: Suite,
+    runs: Sequence[EndToEndRun],
+    rungs: Sequence[AblationStep],
+    seen: Observations,
+    drawing: DrawingSettings,
+) -> ExperimentResult:
     """All figures: `data` for JSON, and the tables that people read."""
     scripted, whole = rungs[0].metrics, rungs[-1].metrics
     data: dict[str, Any] = {
-        "drawing": {name: getattr(drawing, name) for name in Drawing.__dataclass_fields__},
+        "drawing": {name: getattr(drawing, name) for name in DrawingSettings.__dataclass_fields__},
         "detector": runs[0].detector,
         "model_hash": runs[0].model_hash,
         "frames": seen.frames,
@@ -69,10 +73,10 @@ def pixels_result(
         "localisation": localisation_rows(seen),
         "paper_localisation": error_table(suite.camera),
     }
-    return Result("pixels", data, _tables(data, rungs, suite, scripted, whole))
+    return ExperimentResult("pixels", data, _tables(data, rungs, suite, scripted, whole))
 
 
-def within_goal(rungs: Sequence[Rung]) -> bool:
+def within_goal(rungs: Sequence[AblationStep]) -> bool:
     """Whether sensitivity and specificity from pixels are within the goal of the scripted run's."""
     first, last = rungs[0].metrics, rungs[-1].metrics
     pairs = (
@@ -83,7 +87,7 @@ def within_goal(rungs: Sequence[Rung]) -> bool:
     return all(math.isnan(a) or abs(a - b) <= GOAL for a, b in pairs)
 
 
-def verdict(rungs: Sequence[Rung]) -> str:
+def verdict(rungs: Sequence[AblationStep]) -> str:
     """In one or two sentences: how far from the scripted run, and where most of it is lost."""
     parts = []
     for name, label in (("sensitivity", "sensitivity"), ("specificity", "specificity")):
@@ -104,7 +108,7 @@ def verdict(rungs: Sequence[Rung]) -> str:
     return f"{'; '.join(parts)}: {held} {100 * GOAL:.0f} points."
 
 
-def _stage(rungs: Sequence[Rung], index: int) -> dict[str, Any]:
+def _stage(rungs: Sequence[AblationStep], index: int) -> dict[str, Any]:
     rung = rungs[index]
     now = rung.metrics.as_dict()
     change: dict[str, float | None] = {}
@@ -118,36 +122,36 @@ def _stage(rungs: Sequence[Rung], index: int) -> dict[str, Any]:
 
 def _tables(
     data: dict[str, Any],
-    rungs: Sequence[Rung],
+    rungs: Sequence[AblationStep],
     suite: Suite,
     scripted: Metrics,
     whole: Metrics,
-) -> tuple[Table, ...]:
-    stages: list[tuple[Cell, ...]] = [
-        (rung.name, *shown(rung.metrics.as_dict())[:5], rung.adds) for rung in rungs
+) -> tuple[ResultTable, ...]:
+    stages: list[tuple[CellValue, ...]] = [
+        (rung.name, *metric_cells(rung.metrics.as_dict())[:5], rung.adds) for rung in rungs
     ]
-    scenarios: list[tuple[Cell, ...]] = []
+    scenarios: list[tuple[CellValue, ...]] = []
     for i, name in enumerate(suite.names):
         a, b = scripted.scenario_dict(i), whole.scenario_dict(i)
         scenarios.append(
             (
                 name,
-                percent(a["sensitivity"]),
-                percent(b["sensitivity"]),
-                percent(a["specificity"]),
-                percent(b["specificity"]),
+                rounded_percent(a["sensitivity"]),
+                rounded_percent(b["sensitivity"]),
+                rounded_percent(a["specificity"]),
+                rounded_percent(b["specificity"]),
                 a["mean_warning_budget_s"],
                 b["mean_warning_budget_s"],
             )
         )
-    recall: list[tuple[Cell, ...]] = [
+    recall: list[tuple[CellValue, ...]] = [
         (r["kind"], f"{r['from_m']:g}-{r['to_m']:g}", r["seen"], *_percents(r, "found", "recall"))
         for r in data["detection"]["by_distance"]
         if r["seen"]
     ]
     false = data["detection"]["false_per_100_frames"]
     note = ", ".join(f"{kind.label} {false[kind.label]:.2f}" for kind in Kind)
-    places: list[tuple[Cell, ...]] = [
+    places: list[tuple[CellValue, ...]] = [
         (
             r["kind"],
             f"{r['from_m']:g}-{r['to_m']:g}",
@@ -158,26 +162,26 @@ def _tables(
         if r["found"]
     ]
     return (
-        Table(
+        ResultTable(
             "stages",
             "From the scripted run to pixels, stage by stage",
-            ("stage", *SHOWN_COLUMNS[:5], "what it adds"),
+            ("stage", *METRIC_COLUMNS[:5], "what it adds"),
             stages,
         ),
-        Table(
+        ResultTable(
             "scenarios",
             "Scripted and from pixels, by scenario",
             ("scenario", "sens, %", "pixels, %", "spec, %", "pixels %", "budget, s", "pixels, s"),
             scenarios,
         ),
-        Table(
+        ResultTable(
             "recall",
             "Found by the detector, by distance",
             ("kind", "distance, m", "seen", "found, %", "as itself, %"),
             recall,
             note=f"false detections per 100 frames: {note}",
         ),
-        Table(
+        ResultTable(
             "localisation",
             "Localisation error by distance, metres",
             ("kind", "distance, m", "found", "mean", "90th", "exact box", "box model"),
@@ -187,9 +191,9 @@ def _tables(
     )
 
 
-def _percents(row: dict[str, Any], *names: str) -> tuple[Cell, ...]:
-    return tuple(percent(row[name]) for name in names)
+def _percents(row: dict[str, Any], *names: str) -> tuple[CellValue, ...]:
+    return tuple(rounded_percent(row[name]) for name in names)
 
 
-def _metres(value: float | None) -> Cell:
+def _metres(value: float | None) -> CellValue:
     return None if value is None else round(value, 3)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from bikeped.config import LoadedConfig
 from bikeped.feedback import SignalLogic
 from bikeped.lab.endtoend.drawn_source import DrawnSource
-from bikeped.lab.process_pool import workers
+from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
@@ -26,7 +26,7 @@ from bikeped.types import Detections
 
 
 @dataclass(frozen=True)
-class PixelRun:
+class EndToEndRun:
     """One scenario from pixels: what was drawn, found and decided in each frame."""
 
     scenario: Scenario
@@ -58,7 +58,7 @@ def run_scenario(
     conditions: Conditions,
     size: tuple[int, int],
     eye: Eye | None = None,
-) -> PixelRun:
+) -> EndToEndRun:
     """Draws `scenario` and runs it through the loop; `eye` in place of the configured model."""
     looking = eye if eye is not None else load_eye(loaded)
     painter = ScenePainter(scenario, scene_camera(loaded, size), conditions)
@@ -77,7 +77,7 @@ def run_scenario(
         await loop.run()
 
     asyncio.run(through())
-    return PixelRun(
+    return EndToEndRun(
         scenario=scenario,
         objects=tuple(source.objects),
         detections=tuple(kept.detections),
@@ -97,7 +97,7 @@ def run_all(
     size: tuple[int, int],
     processes: int = 1,
     progress: Callable[[int], None] = lambda done: None,
-) -> list[PixelRun]:
+) -> list[EndToEndRun]:
     """Every scenario, longest first over `processes`, in the given order."""
     if processes == 1:
         runs = []
@@ -105,8 +105,8 @@ def run_all(
             runs.append(run_scenario(loaded, scenario, conditions, size))
             progress(len(runs))
         return runs
-    found: dict[int, PixelRun] = {}
-    with workers(processes) as pool:
+    found: dict[int, EndToEndRun] = {}
+    with worker_pool(processes) as pool:
         order = sorted(range(len(scenarios)), key=lambda i: -scenarios[i].duration_s)
         jobs = {i: pool.submit(run_scenario, loaded, scenarios[i], conditions, size) for i in order}
         for index in order:

@@ -23,9 +23,14 @@ import numpy as np
 
 from bikeped.config import DecisionConfig
 from bikeped.geometry import CameraPose, GroundCamera, Lens
-from bikeped.lab.experiments.deterministic import Progress, percent, quiet
-from bikeped.lab.experiments.montecarlo import Observed, Plan, simulate_views, summaries
-from bikeped.lab.result_tables import Result, Table
+from bikeped.lab.experiments.deterministic import ProgressCallback, no_progress, rounded_percent
+from bikeped.lab.experiments.montecarlo import (
+    DetectableObjects,
+    LossModel,
+    simulate_views,
+    summarize_metrics,
+)
+from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
@@ -82,25 +87,25 @@ def poses(width_ft: float, cameras: int) -> tuple[CameraPose, ...]:
     return (near,) if cameras == 1 else (near, far)
 
 
-def observe(
+def detectable_objects(
     scenario: Scenario,
     camera: GroundCamera,
     where: Sequence[CameraPose],
     recall: RecallModel = _SIZE,
     visible_only: bool = False,
-) -> Observed:
+) -> DetectableObjects:
     """What one camera, or several fused, could detect; see the module's text."""
     seen = [simulate_perception(scenario, camera, pose) for pose in where]
-    return fuse(scenario.name, seen, where, recall, visible_only)
+    return fuse_cameras(scenario.name, seen, where, recall, visible_only)
 
 
-def fuse(
+def fuse_cameras(
     name: str,
     seen: Sequence[PerceptionResult],
     where: Sequence[CameraPose],
     recall: RecallModel = _SIZE,
     visible_only: bool = False,
-) -> Observed:
+) -> DetectableObjects:
     """The same from what each camera, at `where`, made of scenario `name`."""
     rates = [_recall(s, recall, visible_only) for s in seen]
     xy, area = seen[0].observed_m, seen[0].area_px2
@@ -110,7 +115,7 @@ def fuse(
         xy = np.where(larger[..., None], moved, xy)
         area = np.maximum(area, other.area_px2)
     missed = np.prod([1 - rate for rate in rates], axis=0)
-    return Observed(name, xy, 1 - missed, seen[0].present, seen[0].kind)
+    return DetectableObjects(name, xy, 1 - missed, seen[0].present, seen[0].kind)
 
 
 def _recall(seen: PerceptionResult, recall: RecallModel, visible_only: bool) -> FloatArray:
@@ -129,12 +134,14 @@ def _measured(
     """By view: summaries over trials by the definition, and with invisible objects undetected."""
     truth = GroundTruthFrames.join([compute_ground_truth(scenario)])
     observed = [
-        [observe(scenario, camera, where, recall, visible_only)]
+        [detectable_objects(scenario, camera, where, recall, visible_only)]
         for visible_only in (False, True)
         for camera, where in views
     ]
-    found = simulate_views(observed, truth, Plan(recall, None), {"": decision}, range(trials), seed)
-    told = [summaries(part[0, 0][""]) for part in found]
+    found = simulate_views(
+        observed, truth, LossModel(recall, None), {"": decision}, range(trials), seed
+    )
+    told = [summarize_metrics(part[0, 0][""]) for part in found]
     return list(zip(told[: len(views)], told[len(views) :], strict=True))
 
 
@@ -144,8 +151,8 @@ def deployment(
     trials: int = DEPLOYMENT_TRIALS,
     seed: int = 0,
     recall: RecallModel = _SIZE,
-    progress: Progress = quiet,
-) -> Result:
+    progress: ProgressCallback = no_progress,
+) -> ExperimentResult:
     """Road widths, one camera and two, both mounts. Progress counts widths."""
     cases = [(height, pitch, cameras) for height, pitch in MOUNTS for cameras in (1, 2)]
     rows: list[dict[str, Any]] = []
@@ -166,7 +173,7 @@ def deployment(
         progress(count + 1)
     rows.sort(key=lambda r: (-r["height_m"], r["cameras"], r["width_ft"]))
     data = {"rows": rows, "trials": trials, "seed": seed, "recall": recall.mode, "fov_deg": FOV_DEG}
-    table = Table(
+    table = ResultTable(
         "deployment",
         "Road widths, one camera and two",
         (
@@ -186,18 +193,18 @@ def deployment(
                 row["pitch_deg"],
                 row["cameras"],
                 row["width_ft"],
-                percent(row["sensitivity"]["mean"]),
-                percent(row["sensitivity"]["low"]),
-                percent(row["sensitivity"]["high"]),
-                percent(row["specificity"]["mean"]),
-                percent(row["visible_only"]["sensitivity"]["mean"]),
+                rounded_percent(row["sensitivity"]["mean"]),
+                rounded_percent(row["sensitivity"]["low"]),
+                rounded_percent(row["sensitivity"]["high"]),
+                rounded_percent(row["specificity"]["mean"]),
+                rounded_percent(row["visible_only"]["sensitivity"]["mean"]),
             )
             for row in rows
         ],
         f"{trials} trials; from and to: 95 % confidence interval of the mean; visible only: what "
         "no camera can see is never detected",
     )
-    return Result("deployment", data, (table,))
+    return ExperimentResult("deployment", data, (table,))
 
 
 def placement(
@@ -206,8 +213,8 @@ def placement(
     trials: int = PLACEMENT_TRIALS,
     seed: int = 0,
     recall: RecallModel = _SIZE,
-    progress: Progress = quiet,
-) -> Result:
+    progress: ProgressCallback = no_progress,
+) -> ExperimentResult:
     """Height by pitch on a road of 40 ft, one camera. Progress counts heights."""
     scenario = road_scenario(PLACEMENT_WIDTH_FT)
     where = poses(PLACEMENT_WIDTH_FT, 1)
@@ -235,12 +242,12 @@ def placement(
     }
     columns = ("height, m", *(f"{pitch:g}\N{DEGREE SIGN}, %" for pitch in PITCHES_DEG))
     tables = tuple(
-        Table(
+        ResultTable(
             name,
             title,
             columns,
             [
-                (height, *(percent(value) for value in row))
+                (height, *(rounded_percent(value) for value in row))
                 for height, row in zip(HEIGHTS_M, grids[grid], strict=True)
             ],
             f"{trials} trials a cell",
@@ -254,4 +261,4 @@ def placement(
             ),
         )
     )
-    return Result("placement", data, tables)
+    return ExperimentResult("placement", data, tables)

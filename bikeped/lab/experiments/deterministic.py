@@ -1,6 +1,6 @@
 """The experiments that need no chance: scenario table, comparison, errors, truth, braking.
 
-Each is a function from a suite to a `Result`: `data` in plain JSON with exact figures (null where
+Each maps a suite to an `ExperimentResult`: `data` in plain JSON with exact figures (null where
 there is none), tables for people in per cent with one decimal.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
 from bikeped.errors import ScenarioError
-from bikeped.lab.result_tables import Cell, Result, Table
+from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
 from bikeped.lab.scenarios.scenario import SIZES_M
 from bikeped.lab.simulation.metrics import Metrics, finite_or_none, measure
 from bikeped.lab.simulation.perception import error_table, localise
@@ -25,11 +25,11 @@ from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, camera_json, com
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruthSettings
 from bikeped.types import BoolArray, State
 
-Progress = Callable[[int], None]
+ProgressCallback = Callable[[int], None]
 
 #: The metrics of the short tables: key, column, factor, decimals. The columns are short, for a
 #: terminal of 80 columns holds them; `contact` is the contact sensitivity.
-SHOWN = (
+TABLE_METRICS = (
     ("sensitivity", "sens, %", 100.0, 1),
     ("specificity", "spec, %", 100.0, 1),
     ("sev_fn", "SevFN, %", 100.0, 1),
@@ -37,7 +37,7 @@ SHOWN = (
     ("mean_warning_budget_s", "budget, s", 1.0, 2),
     ("contact_sensitivity", "contact, %", 100.0, 1),
 )
-SHOWN_COLUMNS = tuple(column for _, column, _, _ in SHOWN)
+METRIC_COLUMNS = tuple(column for _, column, _, _ in TABLE_METRICS)
 
 #: Thresholds of the ground truth that are varied one at a time (paper, table 4).
 CPA_RADII_M = (3.0, 5.0, 7.0)
@@ -47,24 +47,24 @@ MAP_STEP_M = 0.5
 MAP_REACH_M = 25.0
 
 
-def quiet(done: int) -> None:
+def no_progress(done: int) -> None:
     """Progress that nobody watches."""
 
 
-def percent(value: float | None) -> float | None:
+def rounded_percent(value: float | None) -> float | None:
     """A share for a table: per cent, one decimal."""
     return None if value is None else round(100 * value, 1)
 
 
-def shown(metrics: Mapping[str, Any]) -> tuple[Cell, ...]:
-    """The cells of `SHOWN` from a metrics dictionary."""
+def metric_cells(metrics: Mapping[str, Any]) -> tuple[CellValue, ...]:
+    """The cells of `TABLE_METRICS` from a metrics dictionary."""
     return tuple(
         None if metrics.get(key) is None else round(metrics[key] * factor, decimals)
-        for key, _, factor, decimals in SHOWN
+        for key, _, factor, decimals in TABLE_METRICS
     )
 
 
-def provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
+def result_provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
     """What a reader needs to make a result again."""
     return {
         "version": __version__,
@@ -77,7 +77,7 @@ def provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
     }
 
 
-def one_scenario(suite: Suite, name: str) -> Suite:
+def select_scenario(suite: Suite, name: str) -> Suite:
     """The suite with only the scenario of this name (upper and lower case are alike)."""
     found = [s for s in suite.scenarios if s.name.casefold() == name.strip().casefold()]
     if not found:
@@ -90,7 +90,7 @@ def one_scenario(suite: Suite, name: str) -> Suite:
     return replace(suite, scenarios=tuple(found))
 
 
-def run_table(suite: Suite, decision: DecisionConfig) -> Result:
+def run_table(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     """Every scenario under one configuration, and the totals."""
     states = suite.states(decision)
     metrics = measure(suite.truth_frames, states)
@@ -113,7 +113,7 @@ def run_table(suite: Suite, decision: DecisionConfig) -> Result:
         )
     totals = metrics.as_dict()
     budgets = warning_budgets(suite, decision)
-    table = Table(
+    table = ResultTable(
         "run",
         "Scenarios",
         (
@@ -138,22 +138,22 @@ def run_table(suite: Suite, decision: DecisionConfig) -> Result:
                 row["dominant"],
                 row["danger_frames"],
                 row["actionable_frames"],
-                percent(row["sensitivity"]),
-                percent(row["specificity"]),
-                percent(row["sev_fn"]),
-                percent(row["fatigue"]),
-                seconds(row["alert_latency_s"]),
-                seconds(row["mean_warning_budget_s"]),
-                seconds(row["min_warning_budget_s"]),
-                seconds(row["first_onset_lead_s"]),
+                rounded_percent(row["sensitivity"]),
+                rounded_percent(row["specificity"]),
+                rounded_percent(row["sev_fn"]),
+                rounded_percent(row["fatigue"]),
+                rounded_seconds(row["alert_latency_s"]),
+                rounded_seconds(row["mean_warning_budget_s"]),
+                rounded_seconds(row["min_warning_budget_s"]),
+                rounded_seconds(row["first_onset_lead_s"]),
             )
             for row in rows
         ],
         "danger, actionable: frames; late: from the first actionable frame to ALERT; lead: from "
         "the first ALERT to the closest approach",
     )
-    total = Table("run_totals", "All scenarios", SHOWN_COLUMNS, [shown(totals)])
-    return Result(
+    total = ResultTable("run_totals", "All scenarios", METRIC_COLUMNS, [metric_cells(totals)])
+    return ExperimentResult(
         "run",
         {
             "decision": msgspec.to_builtins(decision),
@@ -165,7 +165,7 @@ def run_table(suite: Suite, decision: DecisionConfig) -> Result:
     )
 
 
-def seconds(value: float | None) -> float | None:
+def rounded_seconds(value: float | None) -> float | None:
     """A time for a table: two decimals."""
     return None if value is None else round(value, 2)
 
@@ -175,15 +175,15 @@ def compare_table(
     loaded: LoadedConfig,
     configurations: Mapping[str, DecisionConfig] = CONFIGURATIONS,
     seed: int = 0,
-) -> Result:
+) -> ExperimentResult:
     """All configurations, with and without localisation error."""
     data = compare_json(suite, compare(suite, configurations), loaded, seed)
     tables = tuple(
-        Table(
+        ResultTable(
             name,
             title,
-            ("configuration", *SHOWN_COLUMNS),
-            [(c, *shown(metrics)) for c, metrics in data[key].items()],
+            ("configuration", *METRIC_COLUMNS),
+            [(c, *metric_cells(metrics)) for c, metrics in data[key].items()],
         )
         for name, title, key in (
             ("compare", "Configurations, with localisation error", "configurations"),
@@ -194,10 +194,10 @@ def compare_table(
             ),
         )
     )
-    return Result("compare", data, tables)
+    return ExperimentResult("compare", data, tables)
 
 
-def errors(suite: Suite) -> Result:
+def errors(suite: Suite) -> ExperimentResult:
     """Localisation error: the paper's table, and a map of the ground in front of the camera.
 
     The map's rows go with `x_m` (forward), its columns with `y_m` (right); objects lie with their
@@ -220,11 +220,11 @@ def errors(suite: Suite) -> Result:
     distances = list(dict.fromkeys(float(row["distance_m"]) for row in table))
     cells = {(r["kind"], r["bearing_deg"], r["distance_m"]): float(r["error_m"]) for r in table}
     lines = list(dict.fromkeys((str(r["kind"]), r["bearing_deg"]) for r in table))
-    return Result(
+    return ExperimentResult(
         "errors",
         {"table": table, "map": maps},
         (
-            Table(
+            ResultTable(
                 "errors",
                 "Localisation error, m",
                 ("kind", "bearing, degrees", *(f"{d:g} m" for d in distances)),
@@ -237,7 +237,7 @@ def errors(suite: Suite) -> Result:
     )
 
 
-def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> Result:
+def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     """The same decisions under other thresholds of the ground truth, one varied at a time."""
     base = GroundTruthSettings(braking=suite.truth_settings.braking)
     states = suite.states(decision)
@@ -261,24 +261,24 @@ def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> Result:
         "stopping_margin": "stopping margin",
         "ttc_bound_s": "TTC bound, s",
     }
-    table = Table(
+    table = ResultTable(
         "truth",
         "Thresholds of the ground truth",
-        ("parameter", "value", "default", *SHOWN_COLUMNS),
+        ("parameter", "value", "default", *METRIC_COLUMNS),
         [
             (
                 names[row["parameter"]],
                 "1.87 + clearance" if row["value"] is None else row["value"],
                 "yes" if row["default"] else "",
-                *shown(row),
+                *metric_cells(row),
             )
             for row in rows
         ],
     )
-    return Result("truth", {"rows": rows}, (table,))
+    return ExperimentResult("truth", {"rows": rows}, (table,))
 
 
-def braking_profiles(suite: Suite, decision: DecisionConfig) -> Result:
+def braking_profiles(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     """The same decisions when every cyclist brakes as one profile says, in truth only."""
     states = suite.states(decision)
     profiles = {"scenario": None, "bicycle": "bicycle", "ebike": "ebike", "aashto": "aashto"}
@@ -286,17 +286,17 @@ def braking_profiles(suite: Suite, decision: DecisionConfig) -> Result:
     for name, braking in profiles.items():
         other = suite.with_truth(replace(suite.truth_settings, braking=braking))
         rows.append({"profile": name, "metrics": measure(other.truth_frames, states).as_dict()})
-    table = Table(
+    table = ResultTable(
         "braking",
         "Braking profiles of the ground truth",
-        ("profile", *SHOWN_COLUMNS),
-        [(row["profile"], *shown(row["metrics"])) for row in rows],
+        ("profile", *METRIC_COLUMNS),
+        [(row["profile"], *metric_cells(row["metrics"])) for row in rows],
         "scenario: bicycle or e-bike, as each scenario says",
     )
-    return Result("braking", {"rows": rows}, (table,))
+    return ExperimentResult("braking", {"rows": rows}, (table,))
 
 
-def warning_budgets(suite: Suite, decision: DecisionConfig) -> Result:
+def warning_budgets(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     """Time from each onset of ALERT to the closest approach, where there are actionable frames.
 
     The class goes by the worst onset of a scenario; a scenario without any is "below".
@@ -319,17 +319,23 @@ def warning_budgets(suite: Suite, decision: DecisionConfig) -> Result:
                 "class": budget_class(worst),
             }
         )
-    table = Table(
+    table = ResultTable(
         "budgets",
         "Warning budgets",
         ("scenario", "mean, s", "min, s", "onsets", "class"),
         [
-            (r["scenario"], seconds(r["mean"]), seconds(r["min"]), len(r["onsets"]), r["class"])
+            (
+                r["scenario"],
+                rounded_seconds(r["mean"]),
+                rounded_seconds(r["min"]),
+                len(r["onsets"]),
+                r["class"],
+            )
             for r in rows
         ],
         f"distracted {PEDESTRIAN_PRT_S} s, attentive {ATTENTIVE_PRT_S} s; by the worst onset",
     )
-    return Result("budgets", {"rows": rows}, (table,))
+    return ExperimentResult("budgets", {"rows": rows}, (table,))
 
 
 def onsets(alert: BoolArray) -> BoolArray:

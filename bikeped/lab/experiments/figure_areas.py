@@ -16,10 +16,10 @@ from bikeped.lab.plotting import (
     ORANGE,
     RED,
     SKY,
-    Sheet,
-    percents,
-    plain,
-    reals,
+    FigureSheet,
+    escape_dollars,
+    to_floats,
+    to_percents,
 )
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
 from bikeped.types import FloatArray
@@ -41,7 +41,7 @@ def budgets(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     from matplotlib.patches import Patch
 
     rows = sorted(data["rows"], key=lambda r: (-(r["mean"] or -1.0), r["scenario"]))
-    with Sheet(title, caption, 7.0, 0.24 * len(rows) + 0.8, legend_rows=3) as sheet:
+    with FigureSheet(title, caption, 7.0, 0.24 * len(rows) + 0.8, legend_rows=3) as sheet:
         axes = sheet.axes[0]
         for y, row in enumerate(rows):
             colour, hatch, _ = _CLASSES.get(row["class"], (GREY, "", row["class"]))
@@ -69,7 +69,7 @@ def budgets(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
             )
         for value, dash in ((PEDESTRIAN_PRT_S, "-"), (ATTENTIVE_PRT_S, "--")):
             axes.axvline(value, color=BLACK, linewidth=1.1, linestyle=dash, zorder=4)
-        axes.set_yticks(range(len(rows)), [plain(r["scenario"]) for r in rows])
+        axes.set_yticks(range(len(rows)), [escape_dollars(r["scenario"]) for r in rows])
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlim(0, None)
         axes.tick_params(axis="y", length=0)
@@ -95,7 +95,7 @@ def deployment(data: Data, title: str, caption: str, folder: Path) -> list[Path]
     rows = data["rows"]
     mounts = list(dict.fromkeys((r["height_m"], r["pitch_deg"]) for r in rows))
     looks = {1: (SKY, "///"), 2: (BLUE, "")}
-    with Sheet(title, caption, 7.0, 3.2, 1, len(mounts), 1, sharey=True) as sheet:
+    with FigureSheet(title, caption, 7.0, 3.2, 1, len(mounts), 1, sharey=True) as sheet:
         for axes, (height, pitch) in zip(sheet.axes, mounts, strict=True):
             part = [r for r in rows if (r["height_m"], r["pitch_deg"]) == (height, pitch)]
             widths = sorted({r["width_ft"] for r in part})
@@ -105,7 +105,7 @@ def deployment(data: Data, title: str, caption: str, folder: Path) -> list[Path]
                 x = np.arange(len(widths)) + (number - (len(counts) - 1) / 2) * 0.4
                 sens = [found[w]["sensitivity"] if w in found else {} for w in widths]
                 mean, low, high = (
-                    percents(s.get(k) for s in sens) for k in ("mean", "low", "high")
+                    to_percents(s.get(k) for s in sens) for k in ("mean", "low", "high")
                 )
                 colour, hatch = looks.get(cameras, (GREY, ".."))
                 axes.bar(
@@ -133,7 +133,7 @@ def deployment(data: Data, title: str, caption: str, folder: Path) -> list[Path]
                     found[w].get("visible_only", {}).get("sensitivity", {}) if w in found else {}
                     for w in widths
                 ]
-                lower = percents(s.get("mean") for s in seen)
+                lower = to_percents(s.get("mean") for s in seen)
                 if np.isfinite(lower).any():
                     axes.plot(
                         x,
@@ -156,9 +156,9 @@ def deployment(data: Data, title: str, caption: str, folder: Path) -> list[Path]
 
 def placement(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     """Sensitivity by height and pitch; beside it, when known, with the unseen left undetected."""
-    grids = {"": np.stack([percents(row) for row in data["sensitivity"]])}
+    grids = {"": np.stack([to_percents(row) for row in data["sensitivity"]])}
     if "visible_only_sensitivity" in data:
-        other = np.stack([percents(row) for row in data["visible_only_sensitivity"]])
+        other = np.stack([to_percents(row) for row in data["visible_only_sensitivity"]])
         if not np.allclose(other, grids[""], atol=0.05, equal_nan=True):
             grids = {"as the paper counts": grids[""], "if nobody unseen is detected": other}
     heights, pitches = data["height_m"], data["pitch_deg"]
@@ -167,7 +167,7 @@ def placement(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     low = 5.0 * np.floor(np.percentile(values, 8) / 5) if len(values) else 0.0
     high = max(5.0 * np.ceil(values.max() / 5), low + 10) if len(values) else 100.0
     width = 3.4 * len(grids) + 0.7 if len(grids) > 1 else 6.0
-    with Sheet(title, caption, width, 4.2, 1, len(grids), sharey=True) as sheet:
+    with FigureSheet(title, caption, width, 4.2, 1, len(grids), sharey=True) as sheet:
         image = None
         for axes, (name, grid) in zip(sheet.axes, grids.items(), strict=True):
             image = axes.imshow(
@@ -212,9 +212,9 @@ def braking(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
         ("sev_fn", "SevFN, %", RED, "..."),
     )
     rows = data["rows"]
-    with Sheet(title, caption, 7.0, 0.36 * len(rows) + 1.0, 1, 3, sharey=True) as sheet:
+    with FigureSheet(title, caption, 7.0, 0.36 * len(rows) + 1.0, 1, 3, sharey=True) as sheet:
         for axes, (key, label, colour, hatch) in zip(sheet.axes, panels, strict=True):
-            values = percents(r["metrics"].get(key) for r in rows)
+            values = to_percents(r["metrics"].get(key) for r in rows)
             axes.barh(
                 range(len(rows)),
                 np.nan_to_num(values),
@@ -242,7 +242,7 @@ def braking(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
             axes.tick_params(axis="y", length=0)
         first = sheet.axes[0]
         first.set_yticks(
-            range(len(rows)), [plain(words.get(r["profile"], r["profile"])) for r in rows]
+            range(len(rows)), [escape_dollars(words.get(r["profile"], r["profile"])) for r in rows]
         )
         first.set_ylim(len(rows) - 0.5, -0.5)
         return sheet.save(folder, "braking")
@@ -254,11 +254,13 @@ def error_map(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
 
     maps = data["map"]
     limit = 3.0
-    with Sheet(title, caption, 7.0, 2.6 * len(maps) + 0.4, len(maps), 1, sharex=True) as sheet:
+    with FigureSheet(
+        title, caption, 7.0, 2.6 * len(maps) + 0.4, len(maps), 1, sharex=True
+    ) as sheet:
         image = None
         for axes, (kind, part) in zip(sheet.axes, maps.items(), strict=True):
             x, y = np.asarray(part["x_m"]), np.asarray(part["y_m"])
-            error: FloatArray = np.stack([reals(row) for row in part["error_m"]])
+            error: FloatArray = np.stack([to_floats(row) for row in part["error_m"]])
             # Beyond the range of decisions nothing is used.
             distance = np.hypot(*np.meshgrid(x, y, indexing="ij"))
             beyond, near = distance > MAX_RANGE_M + 1, distance < 5
@@ -274,7 +276,7 @@ def error_map(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
             axes.clabel(lines, fmt="%g m", fontsize=7.5)
             axes.plot(0, 0, "^", color=BLACK, markersize=8, clip_on=False)
             axes.set_aspect("equal")
-            axes.set_title(plain(kind))
+            axes.set_title(escape_dollars(kind))
             axes.set_ylabel("ahead, m")
             axes.set_ylim(0, 25.5)
             axes.set_xlim(-25.5, 25.5)

@@ -17,10 +17,10 @@ from bikeped.lab.plotting import (
     LIGHT,
     RED,
     SERIES,
-    Sheet,
-    percents,
-    plain,
-    reals,
+    FigureSheet,
+    escape_dollars,
+    to_floats,
+    to_percents,
 )
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
 from bikeped.types import FloatArray
@@ -34,21 +34,21 @@ _PREDICTORS = {"none": "no prediction", "first": "first order", "second": "secon
 
 def compare(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     """Sensitivity over specificity, with and without localisation error."""
-    with Sheet(title, caption, 7.0, 4.2) as sheet:
+    with FigureSheet(title, caption, 7.0, 4.2) as sheet:
         axes = sheet.axes[0]
         without = data.get("without_localisation_error", {})
         points = []
         for (name, row), (colour, marker, _) in zip(
             data["configurations"].items(), SERIES, strict=False
         ):
-            x, y = percents([row["specificity"], row["sensitivity"]])
+            x, y = to_percents([row["specificity"], row["sensitivity"]])
             points += [x, y]
             other = without.get(name)
             if other is not None:
-                x0, y0 = percents([other["specificity"], other["sensitivity"]])
+                x0, y0 = to_percents([other["specificity"], other["sensitivity"]])
                 axes.plot([x0, x], [y0, y], color=colour, linewidth=0.8, zorder=2)
                 axes.plot(x0, y0, marker, color=colour, markerfacecolor="white", markersize=6)
-            label = plain(f"{name.replace('_', ' ')}: {y:.1f} / {x:.1f}")
+            label = escape_dollars(f"{name.replace('_', ' ')}: {y:.1f} / {x:.1f}")
             axes.plot(x, y, marker, color=colour, label=label, markersize=8, zorder=3)
         low = min(85.0, np.floor(np.nanmin(points) / 5) * 5 - 2)
         axes.set(xlim=(low, 101), ylim=(low, 101))
@@ -80,13 +80,13 @@ def error_lines(data: Data, title: str, caption: str, folder: Path) -> list[Path
     rows = data["table"]
     kinds = list(dict.fromkeys(str(r["kind"]) for r in rows))
     bearings = list(dict.fromkeys(r["bearing_deg"] for r in rows))
-    with Sheet(title, caption, 7.0, 3.2, 1, len(kinds), 1, sharey=True) as sheet:
+    with FigureSheet(title, caption, 7.0, 3.2, 1, len(kinds), 1, sharey=True) as sheet:
         for axes, kind in zip(sheet.axes, kinds, strict=True):
             for bearing, (colour, marker, dash) in zip(bearings, SERIES, strict=False):
                 part = [r for r in rows if r["kind"] == kind and r["bearing_deg"] == bearing]
                 axes.plot(
                     [r["distance_m"] for r in part],
-                    reals(r["error_m"] for r in part),
+                    to_floats(r["error_m"] for r in part),
                     color=colour,
                     marker=marker,
                     linestyle=dash,
@@ -112,7 +112,7 @@ def truth(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     for row in data["rows"]:
         _, form = names.get(row["parameter"], (row["parameter"], "{}"))
         text = "1.87 s + clearing" if row["value"] is None else form.format(row["value"])
-        labels.append(plain(text + (" (default)" if row.get("default") else "")))
+        labels.append(escape_dollars(text + (" (default)" if row.get("default") else "")))
         groups.append(row["parameter"])
     # A gap between the groups makes room for each one's heading.
     places: list[float] = []
@@ -129,9 +129,9 @@ def truth(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
         ("specificity", "specificity, %", GREEN, "^"),
         ("sev_fn", "SevFN, %", RED, "s"),
     )
-    with Sheet(title, caption, 7.0, 0.27 * len(places) + 1.6, 1, 3, sharey=True) as sheet:
+    with FigureSheet(title, caption, 7.0, 0.27 * len(places) + 1.6, 1, 3, sharey=True) as sheet:
         for axes, (key, label, colour, marker) in zip(sheet.axes, panels, strict=True):
-            values = percents(r.get(key) for r in data["rows"])
+            values = to_percents(r.get(key) for r in data["rows"])
             for y, x, row in zip(places, values, data["rows"], strict=True):
                 fill = colour if row.get("default") else "white"
                 axes.plot(x, y, marker, color=colour, markerfacecolor=fill, markersize=7)
@@ -147,7 +147,8 @@ def truth(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
             axes.grid(visible=False, axis="y")
         first = sheet.axes[0]
         first.set_yticks(
-            [*places, *(y for y, _ in headings)], [*labels, *(plain(t) for _, t in headings)]
+            [*places, *(y for y, _ in headings)],
+            [*labels, *(escape_dollars(t) for _, t in headings)],
         )
         for tick in first.get_yticklabels()[len(places) :]:
             tick.set_fontweight("bold")
@@ -165,7 +166,9 @@ def montecarlo(data: Data, title: str, caption: str, folder: Path) -> list[Path]
     words = {"flat": "one recall", "size": "recall by size", "curve": "recall curve"}
     step = 0.8 / len(cases)
     height = 0.17 * len(names) * len(cases) + 1.4
-    with Sheet(title, caption, 7.0, height, 1, 2, (len(cases) + 1) // 2, sharey=True) as sheet:
+    with FigureSheet(
+        title, caption, 7.0, height, 1, 2, (len(cases) + 1) // 2, sharey=True
+    ) as sheet:
         for axes, (key, label) in zip(
             sheet.axes,
             (("sensitivity", "sensitivity, %"), ("specificity", "specificity, %")),
@@ -178,7 +181,8 @@ def montecarlo(data: Data, title: str, caption: str, folder: Path) -> list[Path]
                     if (r["loss"], r["recall"]) == case
                 }
                 mean, low, high = (
-                    percents(part.get(n, {}).get(k) for n in names) for k in ("mean", "low", "high")
+                    to_percents(part.get(n, {}).get(k) for n in names)
+                    for k in ("mean", "low", "high")
                 )
                 y = np.arange(len(names)) + (index - (len(cases) - 1) / 2) * step
                 loss = "bursts" if case[0] == "burst" else str(case[0])
@@ -191,14 +195,14 @@ def montecarlo(data: Data, title: str, caption: str, folder: Path) -> list[Path]
                     capsize=2.5,
                     linewidth=1.2,
                     markersize=5,
-                    label=plain(f"{loss}, {words.get(case[1], case[1])}"),
+                    label=escape_dollars(f"{loss}, {words.get(case[1], case[1])}"),
                 )
             axes.set_xlabel(label)
             for line in np.arange(len(names) - 1) + 0.5:
                 axes.axhline(line, color=LIGHT, linewidth=0.7)
             axes.grid(visible=False, axis="y")
         first = sheet.axes[0]
-        first.set_yticks(range(len(names)), [plain(n.replace("_", " ")) for n in names])
+        first.set_yticks(range(len(names)), [escape_dollars(n.replace("_", " ")) for n in names])
         first.set_ylim(len(names) - 0.5, -0.5)
         for axes in sheet.axes:
             axes.tick_params(axis="y", length=0)
@@ -214,13 +218,13 @@ def latency(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
         ("sev_fn", "SevFN, %", 100.0),
         ("mean_warning_budget_s", "mean warning budget, s", 1.0),
     )
-    with Sheet(title, caption, 7.0, 5.0, 2, 2, 1, sharex=True) as sheet:
+    with FigureSheet(title, caption, 7.0, 5.0, 2, 2, 1, sharex=True) as sheet:
         for axes, (key, label, scale) in zip(sheet.axes, panels, strict=True):
             for predictor, (colour, marker, dash) in zip(_PREDICTORS, SERIES, strict=False):
                 if key in data.get(predictor, {}):
                     axes.plot(
                         data["delay_ms"],
-                        reals(data[predictor][key], scale),
+                        to_floats(data[predictor][key], scale),
                         color=colour,
                         marker=marker,
                         linestyle=dash,
@@ -242,13 +246,13 @@ def loss_latency(data: Data, title: str, caption: str, folder: Path) -> list[Pat
         ("mean_warning_budget_s", "mean warning budget, s", 1.0),
     )
     found = data["predictors"]
-    with Sheet(title, caption, 7.0, 3.1, 1, 2, 1) as sheet:
+    with FigureSheet(title, caption, 7.0, 3.1, 1, 2, 1) as sheet:
         for axes, (key, label, scale) in zip(sheet.axes, panels, strict=True):
             for predictor, (colour, marker, dash) in zip(_PREDICTORS, SERIES, strict=False):
                 row = _by_figure(found.get(predictor), key)
                 if row is None:
                     continue
-                mean, low, high = (reals(row[k], scale) for k in ("mean", "low", "high"))
+                mean, low, high = (to_floats(row[k], scale) for k in ("mean", "low", "high"))
                 axes.fill_between(data["delay_ms"], low, high, color=colour, alpha=0.18, lw=0)
                 axes.plot(
                     data["delay_ms"],
@@ -270,7 +274,7 @@ def optimize(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     trace = np.asarray(data["trace"], dtype=np.float64)
-    with Sheet(title, caption, 7.0, 3.0) as sheet:
+    with FigureSheet(title, caption, 7.0, 3.0) as sheet:
         axes = sheet.axes[0]
         axes.step(trace[:, 0], trace[:, 1], where="post", color=BLUE)
         axes.plot(trace[-1, 0], trace[-1, 1], "o", color=BLUE)

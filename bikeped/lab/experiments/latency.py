@@ -9,16 +9,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bikeped.config import DecisionConfig
-from bikeped.lab.experiments.deterministic import Progress, percent, quiet, seconds
+from bikeped.lab.experiments.deterministic import (
+    ProgressCallback,
+    no_progress,
+    rounded_percent,
+    rounded_seconds,
+)
 from bikeped.lab.experiments.montecarlo import (
     TRIALS,
-    Plan,
-    measure_lanes,
-    run_plans,
+    LossModel,
+    measure_repetitions,
+    run_trials,
     sorted_suite,
-    summaries,
+    summarize_metrics,
 )
-from bikeped.lab.result_tables import Result, Table
+from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.simulate import FPS, track
@@ -47,7 +52,9 @@ def delay_frames(delay_ms: float) -> int:
     return round(delay_ms * FPS / 1000)
 
 
-def sweep(suite: Suite, decision: DecisionConfig, delays_ms: Sequence[float] = DELAYS_MS) -> Result:
+def sweep(
+    suite: Suite, decision: DecisionConfig, delays_ms: Sequence[float] = DELAYS_MS
+) -> ExperimentResult:
     """Every latency with every predictor, without loss: all of them lanes of one tracker."""
     scenes = [
         s for ms in delays_ms for s in suite.detection_sequences(delay_frames=delay_frames(ms))
@@ -56,14 +63,14 @@ def sweep(suite: Suite, decision: DecisionConfig, delays_ms: Sequence[float] = D
     truth: GroundTruthFrames = suite.truth_frames
     data: dict[str, Any] = {"delay_ms": list(delays_ms)}
     for name, order in PREDICTORS.items():
-        found = measure_lanes(tracked, order, truth, {"": decision})[""]
+        found = measure_repetitions(tracked, order, truth, {"": decision})[""]
         rows = [metrics.as_dict() for metrics in found]
         data[name] = {figure: [row[figure] for row in rows] for figure in FIGURES}
-    return Result("latency", data, (_table(data, "latency", "Camera latency"),))
+    return ExperimentResult("latency", data, (_table(data, "latency", "Camera latency"),))
 
 
-def _table(data: Mapping[str, Any], name: str, title: str) -> Table:
-    return Table(
+def _table(data: Mapping[str, Any], name: str, title: str) -> ResultTable:
+    return ResultTable(
         name,
         title,
         (
@@ -80,12 +87,12 @@ def _table(data: Mapping[str, Any], name: str, title: str) -> Table:
             (
                 predictor,
                 ms,
-                percent(lists["sensitivity"][i]),
-                percent(lists["specificity"][i]),
-                percent(lists["sev_fn"][i]),
-                percent(lists["fatigue"][i]),
-                seconds(lists["mean_warning_budget_s"][i]),
-                percent(lists["contact_sensitivity"][i]),
+                rounded_percent(lists["sensitivity"][i]),
+                rounded_percent(lists["specificity"][i]),
+                rounded_percent(lists["sev_fn"][i]),
+                rounded_percent(lists["fatigue"][i]),
+                rounded_seconds(lists["mean_warning_budget_s"][i]),
+                rounded_percent(lists["contact_sensitivity"][i]),
             )
             for predictor in PREDICTORS
             for lists in (data[predictor],)
@@ -104,18 +111,18 @@ def sweep_with_loss(
     trials: int = TRIALS,
     seed: int = 0,
     processes: int = 1,
-    progress: Progress = quiet,
-) -> Result:
+    progress: ProgressCallback = no_progress,
+) -> ExperimentResult:
     """Latency and lost detections together; size-aware recall, independent losses by default."""
     model = recall or RecallModel("size")
     cases = [(delay_frames(ms), order) for ms in delays_ms for order in PREDICTORS.values()]
-    plan = Plan(model, burst, tuple(dict.fromkeys(cases)))
-    found = run_plans(
+    plan = LossModel(model, burst, tuple(dict.fromkeys(cases)))
+    found = run_trials(
         sorted_suite(suite), [plan], {"": decision}, trials, seed, processes, progress
     )[0]
     predictors: dict[str, Any] = {}
     for name, order in PREDICTORS.items():
-        by_delay = [summaries(found[delay_frames(ms), order][""]) for ms in delays_ms]
+        by_delay = [summarize_metrics(found[delay_frames(ms), order][""]) for ms in delays_ms]
         predictors[name] = {
             figure: {
                 key: [row[figure][key] for row in by_delay]
@@ -140,4 +147,4 @@ def sweep_with_loss(
         },
     }
     table = _table(means, "latency_loss", f"Camera latency with loss, mean of {trials} trials")
-    return Result("latency_loss", data, (table,))
+    return ExperimentResult("latency_loss", data, (table,))

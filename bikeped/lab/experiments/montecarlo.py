@@ -20,9 +20,9 @@ import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.errors import BikepedError
-from bikeped.lab.experiments.deterministic import Progress, percent, quiet
-from bikeped.lab.process_pool import workers
-from bikeped.lab.result_tables import Result, Table
+from bikeped.lab.experiments.deterministic import ProgressCallback, no_progress, rounded_percent
+from bikeped.lab.process_pool import worker_pool
+from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.simulation.metrics import GroundTruthFrames, Metrics, measure
 from bikeped.lab.simulation.perception import (
     PerceptionResult,
@@ -57,7 +57,7 @@ TrialMetrics = dict[str, list[Metrics]]
 
 
 @dataclass(frozen=True)
-class Observed:
+class DetectableObjects:
     """What could be detected in one scenario: arrays over frames and agents [f, a].
 
     `xy_m` [f, a, 2] in the camera ground frame; `kind` [a]; `name` seeds the draws.
@@ -70,9 +70,9 @@ class Observed:
     kind: KindArray
 
     @staticmethod
-    def of(name: str, seen: PerceptionResult, recall: RecallModel) -> Observed:
+    def of(name: str, seen: PerceptionResult, recall: RecallModel) -> DetectableObjects:
         rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
-        return Observed(name, seen.observed_m, rate, seen.present, seen.kind)
+        return DetectableObjects(name, seen.observed_m, rate, seen.present, seen.kind)
 
     def trials(
         self, trials: Sequence[int], seed: int, burst: float | None
@@ -89,7 +89,7 @@ class Observed:
 
 
 @dataclass(frozen=True)
-class Plan:
+class LossModel:
     """One way of losing detections; `cases` are the delays in frames and the predictors' orders
     (0: none) under which the same losses are looked at."""
 
@@ -99,9 +99,9 @@ class Plan:
 
 
 def simulate_trials(
-    observed: Sequence[Observed],
+    observed: Sequence[DetectableObjects],
     truth: GroundTruthFrames,
-    plan: Plan,
+    plan: LossModel,
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
@@ -112,9 +112,9 @@ def simulate_trials(
 
 
 def simulate_views(
-    views: Sequence[Sequence[Observed]],
+    views: Sequence[Sequence[DetectableObjects]],
     truth: GroundTruthFrames,
-    plan: Plan,
+    plan: LossModel,
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
@@ -142,14 +142,14 @@ def simulate_views(
             for case in plan.cases:
                 if case[0] != delay:
                     continue
-                by_name = measure_lanes(late, case[1], truth, configurations)
+                by_name = measure_repetitions(late, case[1], truth, configurations)
                 for name, metrics in by_name.items():
                     for (view, _), one in zip(part, metrics, strict=True):
                         found[view][case][name].append(one)
     return found
 
 
-def measure_lanes(
+def measure_repetitions(
     tracked: TrackHistory,
     order: int,
     truth: GroundTruthFrames,
@@ -172,38 +172,41 @@ def sorted_suite(suite: Suite) -> Suite:
     return replace(suite, scenarios=tuple(sorted(suite.scenarios, key=lambda s: s.name)))
 
 
-def plan_trials(
+def simulate_suite_trials(
     suite: Suite,
-    plan: Plan,
+    plan: LossModel,
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
 ) -> dict[Case, TrialMetrics]:
     """`simulate_trials` of a suite (in order of names), one job of a process."""
     observed = [
-        Observed.of(s.name, seen, plan.recall)
+        DetectableObjects.of(s.name, seen, plan.recall)
         for s, seen in zip(suite.scenarios, suite.perception_results, strict=True)
     ]
     return simulate_trials(observed, suite.truth_frames, plan, configurations, trials, seed)
 
 
-def run_plans(
+def run_trials(
     suite: Suite,
-    plans: Sequence[Plan],
+    plans: Sequence[LossModel],
     configurations: Mapping[str, DecisionConfig],
     trials: int,
     seed: int,
     processes: int = 1,
-    progress: Progress = quiet,
+    progress: ProgressCallback = no_progress,
 ) -> list[dict[Case, TrialMetrics]]:
-    """All plans over all trials; `suite` in order of names. Progress counts `plan_jobs`."""
+    """All plans over all trials; `suite` in order of names. Progress counts `trial_jobs`."""
     parts = [range(trials)[i :: _parts(trials)] for i in range(_parts(trials))]
     jobs = [(i, part) for i in range(len(plans)) for part in parts]
     done: dict[tuple[int, int], dict[Case, TrialMetrics]] = {}
     if processes > 1 and len(jobs) > 1:
-        with workers(min(processes, len(jobs))) as pool:
+        with worker_pool(min(processes, len(jobs))) as pool:
             waiting = {
-                pool.submit(plan_trials, suite, plans[i], configurations, part, seed): (i, part)
+                pool.submit(simulate_suite_trials, suite, plans[i], configurations, part, seed): (
+                    i,
+                    part,
+                )
                 for i, part in jobs
             }
             for count, future in enumerate(as_completed(waiting)):
@@ -212,7 +215,7 @@ def run_plans(
                 progress(count + 1)
     else:
         for count, (i, part) in enumerate(jobs):
-            done[i, part.start] = plan_trials(suite, plans[i], configurations, part, seed)
+            done[i, part.start] = simulate_suite_trials(suite, plans[i], configurations, part, seed)
             progress(count + 1)
     merged = []
     for i, plan in enumerate(plans):
@@ -228,8 +231,8 @@ def run_plans(
     return merged
 
 
-def plan_jobs(plans: int, trials: int) -> int:
-    """How far the progress of `run_plans` counts."""
+def trial_jobs(plans: int, trials: int) -> int:
+    """How far the progress of `run_trials` counts."""
     return plans * _parts(trials)
 
 
@@ -238,7 +241,7 @@ def _parts(trials: int) -> int:
     return min(trials, max(8, trials // 50))
 
 
-def summary(values: Iterable[float], most: float = float("inf")) -> dict[str, float | int | None]:
+def summarize(values: Iterable[float], most: float = float("inf")) -> dict[str, float | int | None]:
     """Mean over trials with its 95 % confidence interval (Student), and the trials' own spread.
 
     No figure lies below 0 or above `most` (1 for a share), so the interval ends there. Trials
@@ -280,16 +283,16 @@ def _student(freedom: int) -> float:
     return float(stdtrit(freedom, 0.975))
 
 
-def summaries(metrics: Sequence[Metrics]) -> dict[str, Any]:
-    """`summary` of every figure of a metrics dictionary over trials."""
+def summarize_metrics(metrics: Sequence[Metrics]) -> dict[str, Any]:
+    """`summarize` of every figure of a metrics dictionary over trials."""
     rows = [m.as_dict() for m in metrics]
-    return {key: summary((_real(row[key]) for row in rows), _most(key)) for key in rows[0]}
+    return {key: summarize((_real(row[key]) for row in rows), _most(key)) for key in rows[0]}
 
 
-def scenario_summaries(metrics: Sequence[Metrics], index: int) -> dict[str, Any]:
+def summarize_scenario(metrics: Sequence[Metrics], index: int) -> dict[str, Any]:
     """The same of one scenario's figures."""
     rows = [m.scenario_dict(index) for m in metrics]
-    return {key: summary((_real(row[key]) for row in rows), _most(key)) for key in rows[0]}
+    return {key: summarize((_real(row[key]) for row in rows), _most(key)) for key in rows[0]}
 
 
 def _real(value: float | None) -> float:
@@ -304,8 +307,8 @@ def montecarlo(
     burst: float = BURST_FRAMES,
     curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None,
     processes: int = 1,
-    progress: Progress = quiet,
-) -> Result:
+    progress: ProgressCallback = no_progress,
+) -> ExperimentResult:
     """Independent and bursty losses, recall flat, by size and (when given) by curve.
 
     `by_scenario` tells the first configuration, independent losses, the finest recall given.
@@ -313,17 +316,17 @@ def montecarlo(
     ordered = sorted_suite(suite)
     models = recall_models(curve)
     cases = [(loss, model) for loss in ("independent", "burst") for model in models]
-    plans = [Plan(model, burst if loss == "burst" else None) for loss, model in cases]
-    found = run_plans(ordered, plans, configurations, trials, seed, processes, progress)
+    plans = [LossModel(model, burst if loss == "burst" else None) for loss, model in cases]
+    found = run_trials(ordered, plans, configurations, trials, seed, processes, progress)
     rows: list[dict[str, Any]] = []
     for (loss, model), part in zip(cases, found, strict=True):
         for name, metrics in part[0, 0].items():
             case = {"loss": loss, "recall": model.mode, "configuration": name}
-            rows.append({**case, "metrics": summaries(metrics)})
+            rows.append({**case, "metrics": summarize_metrics(metrics)})
     detailed = len(models) - 1
     first = next(iter(configurations))
     by_scenario = {
-        name: scenario_summaries(found[detailed][0, 0][first], ordered.names.index(name))
+        name: summarize_scenario(found[detailed][0, 0][first], ordered.names.index(name))
         for name in suite.names
     }
     data = {
@@ -340,15 +343,15 @@ def montecarlo(
     }
     if curve is not None:
         data["curve"] = {"area_px2": list(curve[0]), "recall": list(curve[1])}
-    return Result("montecarlo", data, tuple(_tables(data, burst, trials)))
+    return ExperimentResult("montecarlo", data, tuple(_tables(data, burst, trials)))
 
 
 def montecarlo_jobs(trials: int, curve: bool) -> int:
     """How far the progress of `montecarlo` counts."""
-    return plan_jobs(6 if curve else 4, trials)
+    return trial_jobs(6 if curve else 4, trials)
 
 
-def _tables(data: Mapping[str, Any], burst: float, trials: int) -> Iterator[Table]:
+def _tables(data: Mapping[str, Any], burst: float, trials: int) -> Iterator[ResultTable]:
     columns = ("sens, %", "from, %", "to, %", "spec, %", "SevFN, %", "fatigue, %")
     ends = ("budget, s", "contact, %")
     note = (
@@ -360,17 +363,17 @@ def _tables(data: Mapping[str, Any], burst: float, trials: int) -> Iterator[Tabl
         means = {key: value["mean"] for key, value in metrics.items()}
         budget = means["mean_warning_budget_s"]
         return (
-            percent(means["sensitivity"]),
-            percent(metrics["sensitivity"]["low"]),
-            percent(metrics["sensitivity"]["high"]),
-            percent(means["specificity"]),
-            percent(means["sev_fn"]),
-            percent(means["fatigue"]),
+            rounded_percent(means["sensitivity"]),
+            rounded_percent(metrics["sensitivity"]["low"]),
+            rounded_percent(metrics["sensitivity"]["high"]),
+            rounded_percent(means["specificity"]),
+            rounded_percent(means["sev_fn"]),
+            rounded_percent(means["fatigue"]),
             None if budget is None else round(budget, 2),
-            percent(means.get("contact_sensitivity")),
+            rounded_percent(means.get("contact_sensitivity")),
         )
 
-    yield Table(
+    yield ResultTable(
         "montecarlo",
         "Monte Carlo",
         ("loss", "recall", "configuration", *columns, *ends),
@@ -378,7 +381,7 @@ def _tables(data: Mapping[str, Any], burst: float, trials: int) -> Iterator[Tabl
         note,
     )
     case = data["by_scenario_of"]
-    yield Table(
+    yield ResultTable(
         "montecarlo_by_scenario",
         f"Monte Carlo by scenario: {case['configuration']}, {case['loss']}, {case['recall']}",
         ("scenario", *columns, ends[0]),

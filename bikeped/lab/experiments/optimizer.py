@@ -18,8 +18,13 @@ from scipy.optimize import Bounds, differential_evolution
 
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.errors import ScenarioError
-from bikeped.lab.experiments.deterministic import SHOWN_COLUMNS, Progress, quiet, shown
-from bikeped.lab.result_tables import Result, Table
+from bikeped.lab.experiments.deterministic import (
+    METRIC_COLUMNS,
+    ProgressCallback,
+    metric_cells,
+    no_progress,
+)
+from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.simulation.metrics import Metrics, measure
 from bikeped.lab.simulation.simulate import states
 from bikeped.lab.simulation.suite import Suite
@@ -80,8 +85,8 @@ def optimize(
     seed: int = SEED,
     maxiter: int = MAXITER,
     popsize: int = POPSIZE,
-    progress: Progress = quiet,
-) -> Result:
+    progress: ProgressCallback = no_progress,
+) -> ExperimentResult:
     """The best parameters for this suite. Progress counts evaluations."""
     truth, run = suite.truth_frames, suite.rule_input
     if not truth.actionable.any():
@@ -123,10 +128,19 @@ def optimize(
             "metrics": before.as_dict(),
         },
     }
-    table = Table(
+    table = ResultTable(
         "optimize",
         f"Optimiser, {count} evaluations",
-        ("configuration", "cost", "N", "d_min, m", "d_max, m", "delta_min, m", "k", *SHOWN_COLUMNS),
+        (
+            "configuration",
+            "cost",
+            "N",
+            "d_min, m",
+            "d_max, m",
+            "delta_min, m",
+            "k",
+            *METRIC_COLUMNS,
+        ),
         [
             (
                 name,
@@ -136,7 +150,7 @@ def optimize(
                 round(d.d_max_m, 3),
                 round(d.min_displacement_m, 4),
                 d.lookback_frames,
-                *shown(m.as_dict()),
+                *metric_cells(m.as_dict()),
             )
             for name, value, d, m in (
                 ("configured", cost(before), base, before),
@@ -144,7 +158,7 @@ def optimize(
             )
         ],
     )
-    return Result("optimize", data, (table,))
+    return ExperimentResult("optimize", data, (table,))
 
 
 def evaluations(maxiter: int = MAXITER, popsize: int = POPSIZE) -> int:
@@ -173,7 +187,7 @@ def _search(
     return np.asarray(found.x, np.float64)
 
 
-def candidate_yaml(result: Result, suite_hash: str, config_hash: str) -> str:
+def candidate_yaml(result: ExperimentResult, suite_hash: str, config_hash: str) -> str:
     """A file with the found decision section, and in comments where it comes from."""
     data = result.data
     section = msgspec.yaml.encode({"decision": data["decision"]}).decode()

@@ -15,9 +15,9 @@ from urllib.parse import quote
 
 from bikeped.files import write_whole
 from bikeped.lab.experiments.figures import FIGURES
-from bikeped.lab.governance.gates import all_hold, check_figures
-from bikeped.lab.governance.register import from_figures
-from bikeped.lab.result_tables import Cell, Result, Table
+from bikeped.lab.governance.gates import all_hold, check_gate_figures
+from bikeped.lab.governance.register import register_from_figures
+from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
 
 #: Without the table of scenarios, the verdict is on the comparison's first of these.
 _JUDGED = ("deployed", "selected")
@@ -63,7 +63,7 @@ nav{display:none}figure,tr{break-inside:avoid}h2,h3{break-after:avoid}
 
 
 def write_index(
-    folder: Path, results: list[Result], figures: list[Path], provenance: dict[str, str]
+    folder: Path, results: list[ExperimentResult], figures: list[Path], provenance: dict[str, str]
 ) -> Path:
     """Writes `index.html` into `folder`, linking figures (and tables, where they lie there) by
     relative paths; returns its path. BikepedError names a file that cannot be written."""
@@ -98,12 +98,12 @@ def write_index(
     return path
 
 
-def verdict_html(found: Mapping[str, Result]) -> str:
+def verdict_html(found: Mapping[str, ExperimentResult]) -> str:
     """The gates of the configuration in force, in one sentence and a table."""
     name, figures = _judged(found)
     if figures is None:
         return "<p>Nothing was measured, so there is no verdict on the gates.</p>\n"
-    gates = check_figures(figures)
+    gates = check_gate_figures(figures)
     holds = all_hold(gates)
     failed = " and ".join(g.name.lower() for g in gates if not g.holds)
     text = (
@@ -113,7 +113,7 @@ def verdict_html(found: Mapping[str, Result]) -> str:
     )
     rows = "".join(
         f"<tr><td>{escape(g.name)}</td><td class=n>{escape(g.rule)}</td>"
-        f"<td class=n>{escape(g.say(g.measured))}</td>"
+        f"<td class=n>{escape(g.format_value(g.measured))}</td>"
         f"<td class={'yes' if g.holds else 'no'}>{'holds' if g.holds else 'fails'}</td></tr>"
         for g in gates
     )
@@ -129,7 +129,7 @@ def verdict_html(found: Mapping[str, Result]) -> str:
     )
 
 
-def _judged(found: Mapping[str, Result]) -> tuple[str, Mapping[str, Any] | None]:
+def _judged(found: Mapping[str, ExperimentResult]) -> tuple[str, Mapping[str, Any] | None]:
     """The configuration in force, as the table of scenarios measured it; else the paper's."""
     run = found.get("run")
     if run is not None and run.data.get("metrics"):
@@ -141,7 +141,7 @@ def _judged(found: Mapping[str, Result]) -> tuple[str, Mapping[str, Any] | None]
     return name, configurations.get(name)
 
 
-def tested_html(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+def tested_html(found: Mapping[str, ExperimentResult], provenance: Mapping[str, str]) -> str:
     """What went through the simulation, and what did not."""
     data = found["compare"].data if "compare" in found else {}
     count = data.get("scenarios", provenance.get("scenarios", "a set of"))
@@ -188,7 +188,7 @@ def _figures(folder: Path, figures: Sequence[Path]) -> str:
     return "".join(parts) or "<p>No figures were drawn.</p>\n"
 
 
-def _tables(folder: Path, results: Iterable[Result]) -> str:
+def _tables(folder: Path, results: Iterable[ExperimentResult]) -> str:
     parts = []
     for result in results:
         for table in result.tables:
@@ -207,7 +207,7 @@ def _places(folder: Path, name: str) -> list[Path]:
     return [folder / file, folder / "tables" / file]
 
 
-def table_html(table: Table, link: str = "") -> str:
+def table_html(table: ResultTable, link: str = "") -> str:
     """A table with its caption and note; `link` is HTML behind the caption."""
     columns = [[row[i] for row in table.rows] for i in range(len(table.columns))]
     texts = [_column(cells) for cells in columns]
@@ -230,11 +230,11 @@ def table_html(table: Table, link: str = "") -> str:
     )
 
 
-def risks_html(found: Mapping[str, Result], provenance: Mapping[str, str]) -> str:
+def risks_html(found: Mapping[str, ExperimentResult], provenance: Mapping[str, str]) -> str:
     """The residual-risk register of what was measured."""
     _, figures = _judged(found)
     by_scenario = (figures or {}).get("by_scenario", {})
-    register = from_figures(by_scenario, {}, provenance.get("suite_hash", ""))
+    register = register_from_figures(by_scenario, {}, provenance.get("suite_hash", ""))
     hazards, scenarios = register.tables()
     intro = (
         "<p>What the system does not or only partly answer. Field-blocking: more evidence is "
@@ -246,7 +246,7 @@ def risks_html(found: Mapping[str, Result], provenance: Mapping[str, str]) -> st
         columns = [i for i, c in enumerate(scenarios.columns) if c != "Hazard"]
         parts.append(
             table_html(
-                Table(
+                ResultTable(
                     scenarios.name,
                     scenarios.title,
                     tuple(scenarios.columns[i] for i in columns),
@@ -289,18 +289,18 @@ def _href(folder: Path, path: Path) -> str:
     return escape(quote(PurePosixPath(Path(relative).as_posix()).as_posix()))
 
 
-def _is_number(cell: Cell) -> bool:
+def _is_number(cell: CellValue) -> bool:
     """Numbers, and texts that are written numbers: they stand on the right."""
     if isinstance(cell, str):
         return cell.replace(".", "", 1).removeprefix("-").isdecimal()
     return isinstance(cell, (int, float)) and not isinstance(cell, bool)
 
 
-def _numberish(cell: Cell) -> bool:
+def _numberish(cell: CellValue) -> bool:
     return cell is None or cell == "" or _is_number(cell)
 
 
-def _column(cells: Sequence[Cell]) -> list[str]:
+def _column(cells: Sequence[CellValue]) -> list[str]:
     """The texts of a column: its fractions with equally many decimals, so that points align."""
     shown = [f"{c:.6g}" for c in cells if isinstance(c, float)]
     decimals = max((len(t.partition(".")[2]) for t in shown if "e" not in t), default=0)

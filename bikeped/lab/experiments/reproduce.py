@@ -24,9 +24,9 @@ from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.experiments import deployment, latency, montecarlo, optimizer
 from bikeped.lab.experiments import deterministic as experiments
-from bikeped.lab.experiments.deterministic import Progress, provenance, quiet
-from bikeped.lab.process_pool import workers
-from bikeped.lab.result_tables import Result, Table
+from bikeped.lab.experiments.deterministic import ProgressCallback, no_progress, result_provenance
+from bikeped.lab.process_pool import worker_pool
+from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 
@@ -35,7 +35,7 @@ _CODE = (*DECIDING_CODE, *MEASURING_CODE, "config", "types")
 
 
 @dataclass(frozen=True)
-class Settings:
+class ReproduceSettings:
     """What a reproduction may vary."""
 
     trials: int = montecarlo.TRIALS
@@ -53,58 +53,58 @@ class Settings:
         return montecarlo.recall_models(self.curve)[-1]
 
 
-Experiment = Callable[[Suite, LoadedConfig, Settings], Result]
+Experiment = Callable[[Suite, LoadedConfig, ReproduceSettings], ExperimentResult]
 
 
-def _montecarlo(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _montecarlo(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return montecarlo.montecarlo(suite, CONFIGURATIONS, s.trials, s.seed, s.burst, s.curve)
 
 
-def _latency_loss(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _latency_loss(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return latency.sweep_with_loss(
         suite, loaded.config.decision, recall=s.recall, trials=s.trials, seed=s.seed
     )
 
 
-def _optimize(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _optimize(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return optimizer.optimize(suite, loaded.config.decision, maxiter=s.maxiter, popsize=s.popsize)
 
 
-def _deployment(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _deployment(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     decision = loaded.config.decision
     return deployment.deployment(suite.camera, decision, s.deployment_trials, s.seed, s.recall)
 
 
-def _placement(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _placement(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     decision = loaded.config.decision
     return deployment.placement(suite.camera, decision, s.placement_trials, s.seed, s.recall)
 
 
-def _latency(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _latency(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return latency.sweep(suite, loaded.config.decision)
 
 
-def _truth(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _truth(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return experiments.truth_sensitivity(suite, loaded.config.decision)
 
 
-def _braking(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _braking(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return experiments.braking_profiles(suite, loaded.config.decision)
 
 
-def _run(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _run(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return experiments.run_table(suite, loaded.config.decision)
 
 
-def _budgets(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _budgets(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return experiments.warning_budgets(suite, loaded.config.decision)
 
 
-def _compare(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _compare(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return experiments.compare_table(suite, loaded, seed=s.seed)
 
 
-def _errors(suite: Suite, loaded: LoadedConfig, s: Settings) -> Result:
+def _errors(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
     return experiments.errors(suite)
 
 
@@ -146,7 +146,7 @@ def code_version() -> str:
     return hashlib.sha256(f"{code_hash(_CODE)} {np.__version__}".encode()).hexdigest()
 
 
-def key_of(name: str, suite: Suite, loaded: LoadedConfig, settings: Settings) -> str:
+def cache_key(name: str, suite: Suite, loaded: LoadedConfig, settings: ReproduceSettings) -> str:
     """Everything that the result of an experiment depends on, as one hash.
 
     The order of the scenarios counts too: tables and sums follow it.
@@ -166,15 +166,15 @@ def key_of(name: str, suite: Suite, loaded: LoadedConfig, settings: Settings) ->
 
 
 def compute(
-    name: str, suite: Suite, loaded: LoadedConfig, settings: Settings
-) -> tuple[Result, float]:
+    name: str, suite: Suite, loaded: LoadedConfig, settings: ReproduceSettings
+) -> tuple[ExperimentResult, float]:
     """One experiment and the seconds it took: the job of a process."""
     begin = time.perf_counter()
     result = EXPERIMENTS[name](suite, loaded, settings)
     return result, time.perf_counter() - begin
 
 
-def draw(result: Result, suite: Suite, folder: Path) -> list[Path]:
+def draw_figures(result: ExperimentResult, suite: Suite, folder: Path) -> list[Path]:
     """The figures of one experiment: the job of a process too."""
     from bikeped.lab.experiments.figures import draw_all
 
@@ -185,7 +185,7 @@ def draw(result: Result, suite: Suite, folder: Path) -> list[Path]:
 class Reproduction:
     """What a run left: results in the order of the page, those reused, files, seconds."""
 
-    results: tuple[Result, ...]
+    results: tuple[ExperimentResult, ...]
     reused: tuple[str, ...]
     seconds: Mapping[str, float]
     figures: tuple[Path, ...]
@@ -196,10 +196,10 @@ def reproduce(
     suite: Suite,
     loaded: LoadedConfig,
     folder: Path,
-    settings: Settings = Settings(),
+    settings: ReproduceSettings = ReproduceSettings(),
     processes: int = 1,
     figures: bool = True,
-    progress: Progress = quiet,
+    progress: ProgressCallback = no_progress,
 ) -> Reproduction:
     """Runs every experiment that is not there yet, then writes tables, figures and the page.
 
@@ -208,8 +208,8 @@ def reproduce(
     data_folder, table_folder = folder / "data", folder / "tables"
     for part in (data_folder, table_folder):
         make_folder(part)
-    keys = {name: key_of(name, suite, loaded, settings) for name in EXPERIMENTS}
-    found: dict[str, Result] = {}
+    keys = {name: cache_key(name, suite, loaded, settings) for name in EXPERIMENTS}
+    found: dict[str, ExperimentResult] = {}
     seconds: dict[str, float] = {}
     for name, key in keys.items():
         stored = read_stored(data_folder / f"{name}.json", key)
@@ -217,9 +217,9 @@ def reproduce(
             found[name] = stored
     reused = tuple(found)
     progress(len(found))
-    stamp = provenance(suite, loaded, settings.seed)
+    stamp = result_provenance(suite, loaded, settings.seed)
 
-    def keep(name: str, result: Result, took: float) -> None:
+    def keep(name: str, result: ExperimentResult, took: float) -> None:
         found[name], seconds[name] = result, took
         document = {
             "key": keys[name],
@@ -235,12 +235,12 @@ def reproduce(
     missing = [name for name in EXPERIMENTS if name not in found]
     pictures: dict[str, list[Path]] = {}
     if processes > 1:
-        with workers(processes) as pool:
+        with worker_pool(processes) as pool:
             jobs: dict[Future[Any], tuple[str, bool]] = {}
 
             def picture(name: str) -> None:
                 if figures:
-                    job = pool.submit(draw, found[name], suite, folder / "figures")
+                    job = pool.submit(draw_figures, found[name], suite, folder / "figures")
                     jobs[job] = (name, True)
 
             for name in missing:
@@ -260,7 +260,7 @@ def reproduce(
             keep(name, *compute(name, suite, loaded, settings))
         if figures:
             for name, result in found.items():
-                pictures[name] = draw(result, suite, folder / "figures")
+                pictures[name] = draw_figures(result, suite, folder / "figures")
 
     results = tuple(found[name] for name in SHOWN_ORDER)
     for result in results:
@@ -288,14 +288,14 @@ def reproduce(
     return Reproduction(results, reused, seconds, drawn, index)
 
 
-def read_stored(path: Path, key: str) -> Result | None:
+def read_stored(path: Path, key: str) -> ExperimentResult | None:
     """A finished experiment of this key; None when there is none, or it is of another key."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         if document["key"] != key:
             return None
         tables = tuple(
-            Table(
+            ResultTable(
                 t["name"],
                 t["title"],
                 tuple(t["columns"]),
@@ -304,12 +304,12 @@ def read_stored(path: Path, key: str) -> Result | None:
             )
             for t in document["tables"]
         )
-        return Result(path.stem, document["data"], tables)
+        return ExperimentResult(path.stem, document["data"], tables)
     except (OSError, ValueError, KeyError, TypeError):
         return None  # missing, cut off or written by hand: computed again
 
 
-def _table_dict(table: Table) -> dict[str, Any]:
+def _table_dict(table: ResultTable) -> dict[str, Any]:
     return {
         "name": table.name,
         "title": table.title,

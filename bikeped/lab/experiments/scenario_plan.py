@@ -18,9 +18,9 @@ from bikeped.lab.plotting import (
     PURPLE,
     RED,
     SKY,
-    Sheet,
-    plain,
-    stem_of,
+    FigureSheet,
+    escape_dollars,
+    file_stem,
 )
 from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.lab.simulation.suite import Suite
@@ -59,7 +59,7 @@ def draw_plan(suite: Suite, decision: DecisionConfig, index: int, folder: Path) 
     entries = len(kinds) + 3
     columns = entries if entries <= 5 else 3
     rows = -(-entries // columns)
-    with Sheet(f"{scenario.name}: plan", caption, width, height, legend_rows=rows) as sheet:
+    with FigureSheet(f"{scenario.name}: plan", caption, width, height, legend_rows=rows) as sheet:
         axes = sheet.axes[0]
         axes.set_aspect("equal")
         axes.set_xlim(box[0], box[1])
@@ -73,7 +73,7 @@ def draw_plan(suite: Suite, decision: DecisionConfig, index: int, folder: Path) 
         axes.set_xlabel("east, m")
         axes.set_ylabel("north, m")
         sheet.legend(_legend(kinds), columns=columns)
-        return sheet.save(folder, f"{stem_of(scenario.name)}-plan")
+        return sheet.save(folder, f"{file_stem(scenario.name)}-plan")
 
 
 def _bounds(suite: Suite, scenario: Scenario) -> tuple[float, float, float, float]:
@@ -234,7 +234,7 @@ def _legend(kinds: list[str]) -> list[Any]:
                 marker=marker,
                 linestyle=dash,
                 markerfacecolor="white",
-                label=plain(kind),
+                label=escape_dollars(kind),
             )
         )
     alert = Line2D([], [], color=RED, marker="*", linestyle="", markersize=11, label="alert begins")

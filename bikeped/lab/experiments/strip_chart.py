@@ -15,9 +15,9 @@ from bikeped.lab.plotting import (
     ORANGE,
     RED,
     SKY,
-    Sheet,
-    plain,
-    stem_of,
+    FigureSheet,
+    escape_dollars,
+    file_stem,
 )
 from bikeped.lab.simulation.simulate import verdicts
 from bikeped.lab.simulation.suite import Suite
@@ -49,7 +49,7 @@ def draw_strip(suite: Suite, decision: DecisionConfig, index: int, folder: Path)
         "camera alert. Shaded: danger in which a warning still helps, and hatched, danger that "
         "comes too soon. Arrow: what a distracted person needs to react."
     )
-    with Sheet(
+    with FigureSheet(
         title,
         caption,
         7.0,
@@ -69,7 +69,7 @@ def draw_strip(suite: Suite, decision: DecisionConfig, index: int, folder: Path)
         band.set_xlabel("time, s")
         band.set_xlim(0, truth.time_s[-1] + 1 / 30)
         sheet.legend(_legend(), columns=4)
-        return sheet.save(folder, f"{stem_of(scenario.name)}-strip")
+        return sheet.save(folder, f"{file_stem(scenario.name)}-strip")
 
 
 def onsets(state: np.ndarray[Any, np.dtype[np.int8]]) -> BoolArray:
@@ -221,5 +221,5 @@ def _legend() -> list[Any]:
         Line2D([], [], color=BLACK, marker="v", linestyle="", label="closest approach"),
         Patch(facecolor="#fbd9a0", label="danger, actionable"),
         Patch(facecolor="#f3b49b", edgecolor="#b45028", hatch="////", label="danger, imminent"),
-        Line2D([], [], color=BLACK, marker=">", label=plain("time to react")),
+        Line2D([], [], color=BLACK, marker=">", label=escape_dollars("time to react")),
     ]

@@ -35,7 +35,7 @@ class Gate:
     unit: str
     strict: bool = False
 
-    def say(self, value: float) -> str:
+    def format_value(self, value: float) -> str:
         """A figure of this gate in its unit; one that fails never reads like one that holds.
 
         89.96 % must not read 90.0 % beside a gate of 90 %.
@@ -52,7 +52,7 @@ class Gate:
     @property
     def rule(self) -> str:
         """What is required, in words."""
-        return f"{'above' if self.strict else 'at least'} {self.say(self.required)}"
+        return f"{'above' if self.strict else 'at least'} {self.format_value(self.required)}"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -66,16 +66,16 @@ class Gate:
         }
 
 
-def check(metrics: Metrics) -> list[Gate]:
+def check_gates(metrics: Metrics) -> list[Gate]:
     """All gates of a suite's metrics.
 
     Sensitivity counts the actionable frames of all scenarios together, as the definition has it.
     """
-    return check_figures(metrics.as_dict())
+    return check_gate_figures(metrics.as_dict())
 
 
-def check_figures(figures: Mapping[str, Any]) -> list[Gate]:
-    """As `check`, from the JSON of metrics (null: nothing was measured)."""
+def check_gate_figures(figures: Mapping[str, Any]) -> list[Gate]:
+    """As `check_gates`, from the JSON of metrics (null: nothing was measured)."""
 
     def gate(name: str, key: str, required: float, unit: str, strict: bool = False) -> Gate:
         value = figures.get(key)

@@ -24,7 +24,7 @@ from bikeped.config.provenance import (
 )
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.files import write_like
-from bikeped.lab.governance.gates import check
+from bikeped.lab.governance.gates import check_gates
 from bikeped.lab.simulation.metrics import Metrics
 from bikeped.lab.simulation.suite import Suite, camera_json
 
@@ -71,7 +71,7 @@ def provenance_record(
         "code_hash": code_hash(DECIDING_CODE),
         "measuring_code_hash": code_hash((*DECIDING_CODE, *MEASURING_CODE)),
         "metrics": metrics.as_dict(),
-        "gates": [gate.as_dict() for gate in check(metrics)],
+        "gates": [gate.as_dict() for gate in check_gates(metrics)],
         "files": {role: {"name": path.name, "sha256": file_hash(path)} for role, path in files},
     }
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from bikeped.config import DecisionConfig
 from bikeped.lab.governance.gates import BUDGET_ABOVE_S, SENSITIVITY_MIN, SPECIFICITY_MIN
-from bikeped.lab.result_tables import Cell, Table
+from bikeped.lab.result_tables import CellValue, ResultTable
 from bikeped.lab.simulation.suite import Suite
 from bikeped.types import State
 
@@ -97,7 +97,7 @@ HAZARDS = (
 
 
 @dataclass(frozen=True)
-class Register:
+class RiskRegister:
     """Named hazards and every scenario of the suite, with measured figures, for JSON and people."""
 
     suite_hash: str
@@ -111,10 +111,10 @@ class Register:
             "scenarios": self.scenarios,
         }
 
-    def tables(self) -> tuple[Table, Table]:
+    def tables(self) -> tuple[ResultTable, ResultTable]:
         """Named hazards, then scenarios."""
         return (
-            Table(
+            ResultTable(
                 "register_hazards",
                 "Residual risks",
                 ("Failure mode", "Scenarios", "Sensor model", "Field-blocking", "Measured", "Why"),
@@ -132,7 +132,7 @@ class Register:
                 "Field-blocking yes: more evidence before the system runs unsupervised. Monitor: "
                 "collect data in the field.",
             ),
-            Table(
+            ResultTable(
                 "register_scenarios",
                 "Every scenario of the suite",
                 (
@@ -176,7 +176,7 @@ class Register:
         return "\n".join(parts)
 
 
-def build(suite: Suite, decision: DecisionConfig) -> Register:
+def build_register(suite: Suite, decision: DecisionConfig) -> RiskRegister:
     """The register of a decision on a suite."""
     metrics = suite.measure(decision)
     states = suite.states(decision)
@@ -189,15 +189,15 @@ def build(suite: Suite, decision: DecisionConfig) -> Register:
             "danger_frames": int(danger.sum()),
             "danger_alert_frames": int((danger & alert).sum()),
         }
-    return from_figures(figures, {s.name: s.hazard for s in suite.scenarios}, suite.hash)
+    return register_from_figures(figures, {s.name: s.hazard for s in suite.scenarios}, suite.hash)
 
 
-def from_figures(
+def register_from_figures(
     figures: Mapping[str, Mapping[str, Any]], hazards: Mapping[str, str], suite_hash: str = ""
-) -> Register:
+) -> RiskRegister:
     """The register from the figures by scenario of `conformance compare`; `hazards` by scenario."""
     scenarios = [_scenario(name, figures[name], hazards.get(name, "")) for name in figures]
-    return Register(suite_hash, [_named(h, scenarios) for h in HAZARDS], scenarios)
+    return RiskRegister(suite_hash, [_named(h, scenarios) for h in HAZARDS], scenarios)
 
 
 def _scenario(name: str, figures: Mapping[str, Any], hazard: str) -> dict[str, Any]:
@@ -284,7 +284,7 @@ def _seconds(value: float | None) -> str | None:
     return None if value is None else f"{value:.2f}"
 
 
-def _row(cells: tuple[Cell, ...], plain: bool = False) -> str:
+def _row(cells: tuple[CellValue, ...], plain: bool = False) -> str:
     texts = ["-" if c is None else str(c) for c in cells]
     return "| " + " | ".join(t if plain else _escaped(t) for t in texts) + " |"
 

@@ -18,8 +18,8 @@ import numpy as np
 from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
-from bikeped.lab.governance.contest import Contest, Side, contest
-from bikeped.lab.governance.gates import check
+from bikeped.lab.governance.gates import check_gates
+from bikeped.lab.governance.what_if import Comparison, Variant, compare_variants
 from bikeped.lab.testbench.run import BenchRunner
 from bikeped.lab.testbench.settings import (
     VIEW,
@@ -46,11 +46,11 @@ class InvocationOptions:
         return words
 
 
-def challenge(work: BenchRunner, bench: BenchSettings) -> Contest:
+def challenge(work: BenchRunner, bench: BenchSettings) -> Comparison:
     """Runs both sides."""
     before = work.whole(settings_in_force(work.loaded))
     after = before if _same_run(work, bench) else work.whole(bench)
-    return contest(before, work.loaded.config.decision, after, bench.decision)
+    return compare_variants(before, work.loaded.config.decision, after, bench.decision)
 
 
 def _same_run(work: BenchRunner, bench: BenchSettings) -> bool:
@@ -65,8 +65,8 @@ def comparison_json(
     found = challenge(work, bench)
     data = found.as_dict()
     for side, key in ((found.before, "before"), (found.after, "after")):
-        for told, gate in zip(data[key]["gates"], check(side.metrics), strict=True):
-            told["rule"], told["shown"] = gate.rule, gate.say(gate.measured)
+        for told, gate in zip(data[key]["gates"], check_gates(side.metrics), strict=True):
+            told["rule"], told["shown"] = gate.rule, gate.format_value(gate.measured)
     data["strips"] = [_strip(found, name) for name in found.after.suite.names]
     base = settings_in_force(work.loaded)
     data["link"] = settings_to_link(bench, base)
@@ -153,7 +153,7 @@ def _word(value: Any) -> str:
     return repr(value) if isinstance(value, float) else str(value)
 
 
-def _strip(found: Contest, name: str) -> dict[str, Any]:
+def _strip(found: Comparison, name: str) -> dict[str, Any]:
     """States and truth of one scenario as runs of equal frames, before and after."""
     index = found.after.suite.names.index(name)
     truth = found.after.suite.truths[index]
@@ -167,7 +167,7 @@ def _strip(found: Contest, name: str) -> dict[str, Any]:
     }
 
 
-def _states(side: Side, name: str) -> list[list[int]] | None:
+def _states(side: Variant, name: str) -> list[list[int]] | None:
     return runs(side.states[side.part(name)]) if name in side.suite.names else None
 
 

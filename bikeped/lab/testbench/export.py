@@ -29,7 +29,7 @@ from bikeped.lab.experiments.report import (
     tested_html,
     verdict_html,
 )
-from bikeped.lab.result_tables import Result
+from bikeped.lab.result_tables import ExperimentResult
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.testbench.contest import runs
 from bikeped.lab.testbench.pages import configurations
@@ -126,7 +126,7 @@ def _strip(suite: BenchSuite, index: int, play: Mapping[str, Any]) -> dict[str, 
 
 
 def _page(
-    found: Mapping[str, Result],
+    found: Mapping[str, ExperimentResult],
     data: Mapping[str, Any],
     suite: BenchSuite,
     loaded: LoadedConfig,

@@ -20,8 +20,13 @@ import msgspec
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError
 from bikeped.geometry import CameraPose
-from bikeped.lab.experiments.deployment import fuse
-from bikeped.lab.experiments.montecarlo import Observed, Plan, simulate_trials, summaries
+from bikeped.lab.experiments.deployment import fuse_cameras
+from bikeped.lab.experiments.montecarlo import (
+    DetectableObjects,
+    LossModel,
+    simulate_trials,
+    summarize_metrics,
+)
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
 from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
@@ -70,13 +75,13 @@ class BenchSuite(Suite):
         return tuple(simulate_perception(s, self.camera, self.second) for s in self.scenarios)
 
     @cached_property
-    def observed(self) -> tuple[Observed, ...]:
+    def observed(self) -> tuple[DetectableObjects, ...]:
         """What could be detected, by all cameras together, in the first one's ground frame."""
         model = self.perception.model() or RecallModel("size")
         found = []
         for i, scenario in enumerate(self.scenarios):
             views = [self.perception_results[i], *self.second_perception_results[i : i + 1]]
-            one = fuse(scenario.name, views, self.poses, model)
+            one = fuse_cameras(scenario.name, views, self.poses, model)
             if not self.perception.localisation_error:
                 one = replace(one, xy_m=self.perception_results[i].true_m)
             found.append(one)
@@ -137,11 +142,11 @@ def trial_summaries(suite: BenchSuite, bench: BenchSettings) -> dict[str, Any] |
     trials = bench.perception.trials
     check_work(suite.scenarios, trials)
     case = (bench.delay.frames, bench.delay.order)
-    plan = Plan(model, bench.perception.burst_frames, (case,))
+    plan = LossModel(model, bench.perception.burst_frames, (case,))
     found = simulate_trials(
         observed, truth, plan, {"": bench.decision}, range(trials), bench.perception.seed
     )
-    return {"trials": trials, **summaries(found[case][""])}
+    return {"trials": trials, **summarize_metrics(found[case][""])}
 
 
 def check_work(scenarios: Sequence[Scenario], repeats: int = 1) -> None:

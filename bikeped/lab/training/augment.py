@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from bikeped import __version__
 from bikeped.errors import DataSetError
-from bikeped.lab.process_pool import workers
+from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.training.coco import (
     CocoData,
     CocoImage,
@@ -185,7 +185,7 @@ def _results(data: CocoData, folder: Path, settings: AugmentSettings) -> Iterato
             yield _copies(*job, folder, settings)
         return
     batches = iter([jobs[at : at + _BATCH] for at in range(0, len(jobs), _BATCH)])
-    with workers(settings.processes) as pool:
+    with worker_pool(settings.processes) as pool:
         # A few batches ahead: a hundred thousand waiting results would be memory for nothing.
         ahead = {
             pool.submit(_batch, batch, folder, settings)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bikeped.lab.plotting import SERIES, Sheet, plain, reals
+from bikeped.lab.plotting import SERIES, FigureSheet, escape_dollars, to_floats
 from bikeped.lab.training.evaluate import Evaluation, Scores
 from bikeped.lab.training.measures import Row
 
@@ -42,7 +42,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path) -> list[Path]:
         "network input of 1280; below each bin the number of its objects."
     )
     count = len(evaluation.scores)
-    with Sheet(
+    with FigureSheet(
         f"Detection: {labels}",
         caption,
         width=9.6,
@@ -60,7 +60,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path) -> list[Path]:
         return sheet.save(path.parent, path.stem)
 
 
-def _bars(sheet: Sheet, evaluation: Evaluation, panel: int, what: str) -> None:
+def _bars(sheet: FigureSheet, evaluation: Evaluation, panel: int, what: str) -> None:
     axes = sheet.axes[panel]
     count = len(evaluation.scores)
     thick = 0.8 / count
@@ -68,14 +68,16 @@ def _bars(sheet: Sheet, evaluation: Evaluation, panel: int, what: str) -> None:
     place = np.arange(len(names), dtype=np.float64)
     for number, score in enumerate(evaluation.scores):
         rows = [row for _, row in evaluation_rows(score)]
-        values = reals([row.ap if what == "AP" else row.ar for row in rows])
+        values = to_floats([row.ap if what == "AP" else row.ar for row in rows])
         colour = SERIES[number % len(SERIES)][0]
         at = place + (number - (count - 1) / 2) * thick
-        axes.barh(at, np.nan_to_num(values), thick * 0.9, color=colour, label=plain(score.label))
+        axes.barh(
+            at, np.nan_to_num(values), thick * 0.9, color=colour, label=escape_dollars(score.label)
+        )
         for y, value in zip(at, values, strict=True):
             text = "-" if np.isnan(value) else f"{value:.2f}"
             axes.text(np.nan_to_num(value) + 0.02, y, text, va="center", fontsize=7)
-    axes.set_yticks(place, [plain(name) for name in names])
+    axes.set_yticks(place, [escape_dollars(name) for name in names])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.19)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1])
@@ -83,7 +85,7 @@ def _bars(sheet: Sheet, evaluation: Evaluation, panel: int, what: str) -> None:
     axes.grid(False, axis="y")
 
 
-def _curves(sheet: Sheet, scores: Sequence[Scores], panel: int) -> None:
+def _curves(sheet: FigureSheet, scores: Sequence[Scores], panel: int) -> None:
     axes = sheet.axes[panel]
     for number, score in enumerate(scores):
         colour, marker, _ = SERIES[number % len(SERIES)]

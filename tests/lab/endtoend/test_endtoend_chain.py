@@ -9,11 +9,11 @@ import pytest
 from drawn_eyes import OracleEye
 
 from bikeped.config import LoadedConfig, load_config
-from bikeped.lab.endtoend.ablation import ladder
+from bikeped.lab.endtoend.ablation import run_ablation
 from bikeped.lab.endtoend.matching import MIN_VISIBLE
-from bikeped.lab.endtoend.measures import localisation_rows, recall_rows, sights
-from bikeped.lab.endtoend.report import Drawing, pixels_result, verdict
-from bikeped.lab.endtoend.run import PixelRun, run_scenario
+from bikeped.lab.endtoend.measures import collect_observations, localisation_rows, recall_rows
+from bikeped.lab.endtoend.report import DrawingSettings, end_to_end_result, verdict
+from bikeped.lab.endtoend.run import EndToEndRun, run_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
@@ -36,7 +36,7 @@ def scenario() -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def run(loaded: LoadedConfig, scenario: Scenario) -> PixelRun:
+def run(loaded: LoadedConfig, scenario: Scenario) -> EndToEndRun:
     """With an eye that sees all that can be seen, and one bush that it takes for a walker."""
     painter = ScenePainter(scenario, scene_camera(loaded, SIZE), Conditions())
     times = scenario.frame_times().tolist()
@@ -54,16 +54,16 @@ def run(loaded: LoadedConfig, scenario: Scenario) -> PixelRun:
     return run_scenario(loaded, scenario, Conditions(), SIZE, OracleEye(boxes))
 
 
-def test_every_frame_is_decided_once(run: PixelRun, scenario: Scenario) -> None:
+def test_every_frame_is_decided_once(run: EndToEndRun, scenario: Scenario) -> None:
     frames = len(scenario.frame_times())
     assert len(run.state) == len(run.objects) == len(run.detections) == frames
 
 
 def test_a_perfect_eye_loses_nothing_between_occlusion_and_its_boxes(
-    run: PixelRun, scenario: Scenario, loaded: LoadedConfig
+    run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
     suite = Suite.load([scenario], loaded)
-    rungs = {r.name: r for r in ladder(suite, [run], loaded, loaded.config.decision)}
+    rungs = {r.name: r for r in run_ablation(suite, [run], loaded, loaded.config.decision)}
     for name in ("misses", "boxes", "kinds"):
         np.testing.assert_array_equal(rungs[name].states, rungs["occlusion"].states)
     # The bush is a pedestrian for ever: nobody is IDLE with it.
@@ -74,7 +74,7 @@ def test_a_perfect_eye_loses_nothing_between_occlusion_and_its_boxes(
 
 
 def test_the_loop_and_the_ladder_decide_alike(
-    run: PixelRun, scenario: Scenario, loaded: LoadedConfig
+    run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
     """The last rung comes out of the loop, the others out of its judge: same boxes, same states."""
     from bikeped.lab.endtoend.ablation import _judge_boxes
@@ -85,9 +85,11 @@ def test_the_loop_and_the_ladder_decide_alike(
     np.testing.assert_array_equal(again, run.state)
 
 
-def test_measures_of_a_perfect_eye(run: PixelRun, scenario: Scenario, loaded: LoadedConfig) -> None:
+def test_measures_of_a_perfect_eye(
+    run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
+) -> None:
     suite = Suite.load([scenario], loaded)
-    seen = sights([run], suite.perception_results, loaded)
+    seen = collect_observations([run], suite.perception_results, loaded)
     assert seen.false[Kind.PEDESTRIAN] == len(run.state)
     assert seen.false[Kind.CYCLIST] == seen.false[Kind.VEHICLE] == 0
     rows = [r for r in recall_rows(seen) if r["seen"]]
@@ -101,7 +103,7 @@ def test_measures_of_a_perfect_eye(run: PixelRun, scenario: Scenario, loaded: Lo
 
 
 def test_an_eye_that_sees_nothing_is_named(
-    run: PixelRun, scenario: Scenario, loaded: LoadedConfig
+    run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
     blind = replace(
         run,
@@ -109,13 +111,15 @@ def test_an_eye_that_sees_nothing_is_named(
         state=np.zeros_like(run.state),
     )
     suite = Suite.load([scenario], loaded)
-    rungs = ladder(suite, [blind], loaded, loaded.config.decision)
+    rungs = run_ablation(suite, [blind], loaded, loaded.config.decision)
     assert rungs[-1].metrics.sensitivity == 0.0
     text = verdict(rungs)
     assert "misses" in text
     assert "not within 3 points" in text
-    seen = sights([blind], suite.perception_results, loaded)
-    result = pixels_result(suite, [blind], rungs, seen, Drawing(*SIZE, "day", "dry", 0, 0))
+    seen = collect_observations([blind], suite.perception_results, loaded)
+    result = end_to_end_result(
+        suite, [blind], rungs, seen, DrawingSettings(*SIZE, "day", "dry", 0, 0)
+    )
     assert result.data["goal"]["holds"] is False
     assert result.data["stages"][0]["name"] == "scripted"
     assert {t.name for t in result.tables} == {"stages", "scenarios", "recall", "localisation"}

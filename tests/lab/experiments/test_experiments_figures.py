@@ -13,7 +13,7 @@ from bikeped.lab.cli import conformance_governance as governance
 from bikeped.lab.experiments.figures import FIGURES, draw_all
 from bikeped.lab.experiments.scenario_plan import draw_plan
 from bikeped.lab.experiments.strip_chart import draw_strip, onsets, spans
-from bikeped.lab.plotting import Sheet, stem_of
+from bikeped.lab.plotting import FigureSheet, file_stem
 from bikeped.lab.scenarios.scenario import parse_scenario
 from bikeped.lab.simulation.suite import Suite
 
@@ -157,9 +157,9 @@ def test_strip_and_plan_of_any_scenario(suite, tmp_path):
 
 
 def test_a_name_cannot_leave_the_folder():
-    assert stem_of("../../etc/pass wd") == "etc-pass-wd"
-    assert stem_of("///") == "scenario"
-    assert stem_of("\u00fc") == "scenario"
+    assert file_stem("../../etc/pass wd") == "etc-pass-wd"
+    assert file_stem("///") == "scenario"
+    assert file_stem("\u00fc") == "scenario"
 
 
 def test_spans_and_onsets():
@@ -175,7 +175,7 @@ def test_without_matplotlib_the_mend_is_named(suite, tmp_path, monkeypatch):
     with pytest.raises(BikepedError, match=r'pip install "bikeped\[sim\]"'):
         draw_all(DATA, suite, tmp_path)
     with pytest.raises(BikepedError, match="matplotlib"):
-        Sheet("a", "b")
+        FigureSheet("a", "b")
 
 
 def test_drawing_leaves_matplotlib_s_settings_alone(suite, tmp_path):

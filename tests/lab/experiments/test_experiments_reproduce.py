@@ -17,13 +17,15 @@ import pytest
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
 from bikeped.lab.experiments import reproduce as rep
-from bikeped.lab.result_tables import Result
+from bikeped.lab.result_tables import ExperimentResult
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
 
 CONFIG = Path(__file__).parents[3] / "config.yaml"
 LOADED = load_config(CONFIG)
-SMALL = rep.Settings(trials=2, maxiter=1, popsize=2, deployment_trials=2, placement_trials=2)
+SMALL = rep.ReproduceSettings(
+    trials=2, maxiter=1, popsize=2, deployment_trials=2, placement_trials=2
+)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +94,7 @@ def test_two_processes_give_the_same(
 def test_resumes_after_an_interruption(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: object) -> Result:
+    def interrupted(*_: object) -> ExperimentResult:
         raise KeyboardInterrupt
 
     whole = dict(rep.EXPERIMENTS)
@@ -128,20 +130,20 @@ def test_interrupted_from_the_terminal_it_ends_at_once(tmp_path: Path) -> None:
 
 
 def test_key_covers_what_a_result_depends_on(suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
-    key = rep.key_of("run", suite, LOADED, SMALL)
-    assert rep.key_of("run", suite, LOADED, SMALL) == key
+    key = rep.cache_key("run", suite, LOADED, SMALL)
+    assert rep.cache_key("run", suite, LOADED, SMALL) == key
     other_config = load_config(CONFIG, ["decision.d_max_m=20"])
     turned = replace(suite, scenarios=suite.scenarios[::-1])
     others = [
-        rep.key_of("truth", suite, LOADED, SMALL),
-        rep.key_of("run", suite, other_config, SMALL),
-        rep.key_of("run", turned, LOADED, SMALL),
-        rep.key_of("run", replace(suite, scenarios=suite.scenarios[:1]), LOADED, SMALL),
-        rep.key_of("run", suite, LOADED, replace(SMALL, burst=3.0)),
-        rep.key_of("run", suite, LOADED, replace(SMALL, curve=((0.0, 1.0), (0.5, 1.0)))),
+        rep.cache_key("truth", suite, LOADED, SMALL),
+        rep.cache_key("run", suite, other_config, SMALL),
+        rep.cache_key("run", turned, LOADED, SMALL),
+        rep.cache_key("run", replace(suite, scenarios=suite.scenarios[:1]), LOADED, SMALL),
+        rep.cache_key("run", suite, LOADED, replace(SMALL, burst=3.0)),
+        rep.cache_key("run", suite, LOADED, replace(SMALL, curve=((0.0, 1.0), (0.5, 1.0)))),
     ]
     monkeypatch.setattr(rep, "code_version", lambda: "another")
-    others.append(rep.key_of("run", suite, LOADED, SMALL))
+    others.append(rep.cache_key("run", suite, LOADED, SMALL))
     assert len({key, *others}) == len(others) + 1
 
 

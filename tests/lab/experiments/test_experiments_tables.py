@@ -51,9 +51,9 @@ def test_run_tells_each_scenario_and_the_totals(suite: Suite) -> None:
 
 
 def test_one_scenario_by_name(suite: Suite) -> None:
-    assert ex.one_scenario(suite, "swerving cyclist").names == ("Swerving Cyclist",)
+    assert ex.select_scenario(suite, "swerving cyclist").names == ("Swerving Cyclist",)
     with pytest.raises(ScenarioError, match="did you mean 'Swerving Cyclist'"):
-        ex.one_scenario(suite, "Swerving Ciclist")
+        ex.select_scenario(suite, "Swerving Ciclist")
 
 
 def test_errors_table_and_map_agree_with_the_camera(suite: Suite) -> None:
@@ -188,7 +188,7 @@ def test_the_bounds_are_the_definition() -> None:
 
 def test_optimiser_refuses_a_suite_without_danger(suite: Suite) -> None:
     with pytest.raises(ScenarioError, match="no scenario has an actionable"):
-        opt.optimize(ex.one_scenario(suite, "Safe Crossing"), SELECTED, maxiter=1, popsize=2)
+        opt.optimize(ex.select_scenario(suite, "Safe Crossing"), SELECTED, maxiter=1, popsize=2)
 
 
 @pytest.mark.parametrize("width", dep.WIDTHS_FT)
@@ -214,7 +214,7 @@ def test_fusion(suite: Suite) -> None:
     seen = [simulate_perception(scenario, camera, pose) for pose in (near, far)]
     model = RecallModel("size")
     rate = [model.recall(np.broadcast_to(s.kind, s.area_px2.shape), s.area_px2) for s in seen]
-    fused = dep.observe(scenario, camera, (near, far))
+    fused = dep.detectable_objects(scenario, camera, (near, far))
     np.testing.assert_allclose(fused.recall, 1 - (1 - rate[0]) * (1 - rate[1]))
     # Whichever camera an object is taken from, it lies near where it is.
     at = fused.present
@@ -222,7 +222,7 @@ def test_fusion(suite: Suite) -> None:
     best = np.where(seen[1].area_px2 > seen[0].area_px2, seen[1].error_m, seen[0].error_m)
     np.testing.assert_allclose(error, best[at], atol=1e-9)
     assert (seen[1].area_px2 > seen[0].area_px2)[at].any()
-    strict = dep.observe(scenario, camera, (near,), visible_only=True)
+    strict = dep.detectable_objects(scenario, camera, (near,), visible_only=True)
     hidden = at & (seen[0].area_px2 == 0)
     assert hidden.any()
     assert (strict.recall[hidden] == 0).all()

@@ -66,8 +66,8 @@ def test_size_of_chunks_changes_nothing(suite: Suite, monkeypatch: pytest.Monkey
 def test_a_trial_is_what_it_is_alone(suite: Suite, burst: float | None) -> None:
     """One scenario, one trial, one lane at a time, and the same figures."""
     ordered = mc.sorted_suite(suite)
-    plan = mc.Plan(RecallModel("size"), burst)
-    found = mc.run_plans(ordered, [plan], TWO, 3, 7)[0][0, 0]
+    plan = mc.LossModel(RecallModel("size"), burst)
+    found = mc.run_trials(ordered, [plan], TWO, 3, 7)[0][0, 0]
     missed = {m.false_negative for m in found["selected"]}
     assert len(missed | {ordered.measure(TWO["selected"]).false_negative}) > 1
     for trial in range(3):
@@ -87,7 +87,7 @@ def test_a_trial_is_what_it_is_alone(suite: Suite, burst: float | None) -> None:
 def test_every_third_detection_or_so_is_lost_as_recall_says(suite: Suite) -> None:
     """Bursts are longer, yet as many detections are lost."""
     seen = suite.perception_results[1]
-    observed = mc.Observed(
+    observed = mc.DetectableObjects(
         "x", seen.observed_m, np.full(seen.area_px2.shape, 0.7), seen.present, seen.kind
     )
     for burst in (None, 5.0):
@@ -151,15 +151,15 @@ def test_loss_and_latency_together(suite: Suite) -> None:
 
 
 def test_summary_is_students() -> None:
-    told = mc.summary([1.0, 2.0, 3.0, 4.0, math.nan])
+    told = mc.summarize([1.0, 2.0, 3.0, 4.0, math.nan])
     assert told["trials"] == 4
     assert told["mean"] == 2.5
     assert told["sd"] == pytest.approx(1.2909944)
     assert told["low"] == pytest.approx(2.5 - 3.1824463 * 1.2909944 / 2, abs=1e-6)
     assert told["high"] == pytest.approx(2.5 + 3.1824463 * 1.2909944 / 2, abs=1e-6)
     assert told["p2_5"] == pytest.approx(1.075)
-    assert mc.summary([2.0])["low"] is None
-    assert mc.summary([math.nan])["mean"] is None
+    assert mc.summarize([2.0])["low"] is None
+    assert mc.summarize([math.nan])["mean"] is None
 
 
 def test_recall_curve_files(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from bikeped.config.provenance import check_provenance, decision_hash
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.lab.cli import conformance_governance as governance
 from bikeped.lab.governance import promote as promoting
-from bikeped.lab.governance.gates import all_hold, check, check_figures
+from bikeped.lab.governance.gates import all_hold, check_gate_figures, check_gates
 from bikeped.lab.scenarios.scenario import load_scenarios
 from bikeped.lab.simulation.suite import Suite
 
@@ -283,18 +283,18 @@ def figures(sensitivity=0.95, specificity=0.95, mean_warning_budget_s=3.0):
     ],
 )
 def test_gates_at_their_bounds(values, holds):
-    assert all_hold(check_figures(figures(**values))) is holds
+    assert all_hold(check_gate_figures(figures(**values))) is holds
 
 
 def test_a_failing_figure_never_reads_like_a_passing_one():
-    gate = check_figures(figures(sensitivity=0.89996))[0]
+    gate = check_gate_figures(figures(sensitivity=0.89996))[0]
     assert not gate.holds
-    assert float(gate.say(gate.measured).split()[0]) < 90.0
-    assert check_figures(figures(sensitivity=0.9347))[0].say(0.9347) == "93.5 %"
-    assert "nothing" in gate.say(math.nan)
+    assert float(gate.format_value(gate.measured).split()[0]) < 90.0
+    assert check_gate_figures(figures(sensitivity=0.9347))[0].format_value(0.9347) == "93.5 %"
+    assert "nothing" in gate.format_value(math.nan)
 
 
 def test_gates_of_metrics_are_those_of_their_json(place):
     loaded = load_config(place / "config.yaml")
     metrics = Suite.load(load_scenarios(place / "suite"), loaded).measure(DecisionConfig())
-    assert check(metrics) == check_figures(metrics.as_dict())
+    assert check_gates(metrics) == check_gate_figures(metrics.as_dict())

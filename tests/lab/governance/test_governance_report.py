@@ -7,7 +7,7 @@ import pytest
 
 from bikeped.errors import BikepedError
 from bikeped.lab.experiments.report import write_index
-from bikeped.lab.result_tables import Result, Table
+from bikeped.lab.result_tables import ExperimentResult, ResultTable
 
 EVIL = '<script>alert("x")</script> & $1$'
 VOID = {"meta", "img", "br", "link", "hr"}
@@ -45,10 +45,14 @@ def page(folder, sensitivity=0.95, figures=(), name=EVIL):
         "mean_warning_budget_s": 3.0,
         "by_scenario": {name: {"sensitivity": 0.5, "min_warning_budget_s": 0.2}},
     }
-    compare = Result(
+    compare = ExperimentResult(
         "compare",
         {"scenarios": 24, "configurations": {"selected": row}},
-        (Table("compare", f"A {EVIL}", ("what", "much"), [(EVIL, 1.5), ("b", None), ("c", 2.0)]),),
+        (
+            ResultTable(
+                "compare", f"A {EVIL}", ("what", "much"), [(EVIL, 1.5), ("b", None), ("c", 2.0)]
+            ),
+        ),
     )
     path = write_index(folder, [compare], list(figures), {"suite_hash": "abc", EVIL: EVIL})
     checker = Checker()
@@ -121,9 +125,9 @@ def test_a_folder_that_is_not_there_is_named():
 def test_the_configuration_in_force_is_judged_when_it_was_run(tmp_path):
     figures = {"sensitivity": 0.5, "specificity": 0.95, "mean_warning_budget_s": 3.0}
     row = {"scenario": "Here", "danger_frames": 5, **figures}
-    run = Result("run", {"metrics": figures, "scenarios": [row]})
+    run = ExperimentResult("run", {"metrics": figures, "scenarios": [row]})
     better = {"selected": {**figures, "sensitivity": 0.99}}
-    compare = Result("compare", {"configurations": better})
+    compare = ExperimentResult("compare", {"configurations": better})
     text = write_index(tmp_path, [run, compare], [], {}).read_text(encoding="utf-8")
     assert "may not be promoted" in text
     assert "not one alert" not in text  # how many alerts there were in danger is not known here

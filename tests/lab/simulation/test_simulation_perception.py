@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bikeped.lab.experiments.montecarlo import Observed
+from bikeped.lab.experiments.montecarlo import DetectableObjects
 from bikeped.lab.simulation.perception import (
     AVERAGE_PRECISION,
     OVERALL_RECALL,
@@ -215,7 +215,7 @@ def test_trials_draw_the_same_whatever_the_order():
 @pytest.mark.parametrize("burst", [None, 5.0])
 def test_trials_of_a_scenario_are_the_same_alone_and_among_others(suite, burst):
     seen = suite.perception_results[suite.names.index("Dense Pedestrian Group")]
-    observed = Observed.of("Dense Pedestrian Group", seen, RecallModel())
+    observed = DetectableObjects.of("Dense Pedestrian Group", seen, RecallModel())
     together = observed.trials([4, 0, 2], 9, burst)
     for scene, trial in zip(together, (4, 0, 2), strict=True):
         alone = observed.trials([trial], 9, burst)[0]

@@ -12,7 +12,12 @@ from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.decision import Decider
 from bikeped.lab.experiments.latency import sweep
-from bikeped.lab.experiments.montecarlo import Plan, plan_trials, sorted_suite, summaries
+from bikeped.lab.experiments.montecarlo import (
+    LossModel,
+    simulate_suite_trials,
+    sorted_suite,
+    summarize_metrics,
+)
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.lab.testbench.playback import TESTS, coverage, playback
@@ -94,11 +99,11 @@ def test_trials_agree_with_monte_carlo(work, suite, recall, mode):
         perception={"recall": recall, "burst_frames": 5.0, "seed": 3, "trials": 2},
         delay={"delay_ms": 66.0, "order": 1},
     )
-    plan = Plan(RecallModel(mode), 5.0, ((2, 1),))
-    found = plan_trials(sorted_suite(suite), plan, {"": BASE.decision}, range(2), 3)
+    plan = LossModel(RecallModel(mode), 5.0, ((2, 1),))
+    found = simulate_suite_trials(sorted_suite(suite), plan, {"": BASE.decision}, range(2), 3)
     assert trial_summaries(work.whole(asked), asked) == {
         "trials": 2,
-        **summaries(found[2, 1][""]),
+        **summarize_metrics(found[2, 1][""]),
     }
 
 

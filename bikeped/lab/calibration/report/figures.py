@@ -14,7 +14,7 @@ from bikeped.lab.calibration.solver.compare import Calibrated
 from bikeped.lab.calibration.solver.initial_guess import FISHEYE
 from bikeped.lab.calibration.solver.lens_fit import Fit
 from bikeped.lab.calibration.solver.lens_model import angles, camera_points
-from bikeped.lab.plotting import BLACK, BLUE, GREY, LIGHT, RED, SERIES, Sheet
+from bikeped.lab.plotting import BLACK, BLUE, GREY, LIGHT, RED, SERIES, FigureSheet
 from bikeped.types import FloatArray
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _BIN_DEG = 10.0
 _RASTER = True
 
 
-def png(sheet: Sheet) -> bytes:
+def png(sheet: FigureSheet) -> bytes:
     """The sheet's picture; the same drawing gives the same bytes."""
     data = io.BytesIO()
     sheet.figure.savefig(data, format="png", metadata={"Software": None})
@@ -35,7 +35,7 @@ def comparison_figure(calibrated: Calibrated, chosen: str) -> bytes:
     """RMS and cross-validated error of every model, least last."""
     fits = sorted(calibrated.fits.values(), key=lambda f: f.cross_validated_px or f.rms_px)[::-1]
     rows = np.arange(len(fits))
-    with Sheet(
+    with FigureSheet(
         "Error of each model on the same corners",
         "Per point, sqrt(mean(dx² + dy²)), on a logarithmic scale. Cross-validated: on pictures "
         f"that did not help to fit the lens ({calibrated.folds} folds). Bold: the model written.",
@@ -100,7 +100,7 @@ def angle_figure(fit: Fit, field: Field) -> bytes:
     """Residuals against the angle from the axis."""
     theta, along, across = radial_residuals(fit)
     edges = np.arange(0, np.degrees(field.half_rad) + _BIN_DEG, _BIN_DEG)
-    with Sheet(
+    with FigureSheet(
         "Residuals against the angle from the optical axis",
         "Each dot a corner, seen minus projected. Line: mean of each ten degrees; band: one "
         "standard deviation. A line that leaves zero is a lens that the model does not follow. "
@@ -140,7 +140,7 @@ def profile_figure(fit: Fit, field: Field) -> bytes:
     theta: FloatArray = np.linspace(0.0, field.half_rad, 400, dtype=np.float64)
     degrees = np.degrees(theta)
     own = fit.radius(theta)
-    with Sheet(
+    with FigureSheet(
         "The lens's profile",
         "Left: image radius against the angle from the axis. Right: how far the four ideal "
         "projections, each with its own best focal length over the angles that were measured, are "
@@ -187,7 +187,7 @@ def board_figure(fit: Fit) -> bytes:
     facing = (fit.state.turn[:, :, 2] * fit.state.move).sum(-1)
     height = np.sign(np.median(facing)) * shape[:, 2].reshape(pattern.rows, pattern.columns)
     bound = max(float(np.abs(height).max()), 0.1)
-    with Sheet(
+    with FigureSheet(
         "The board as it is",
         "Offsets of the corners from a flat, even board in per cent of a square. Colour: out of "
         "the plane (positive away from the camera). Arrows: in the plane, drawn forty times as "
@@ -227,7 +227,7 @@ def coverage_figure(fit: Fit, field: Field, gaps: FloatArray | None = None) -> b
     points = camera_points(fit.state, fit.sightings.flat)[fit.sightings.seen]
     theta, phi = np.degrees(angles(points)), np.arctan2(points[:, 1], points[:, 0])
     half = float(np.degrees(field.half_rad))
-    with Sheet(
+    with FigureSheet(
         "Where the boards were",
         "Each dot a corner, in the lens's own directions: the middle is the optical axis, the "
         "circle the edge of the field of view. Hatched: parts of the picture with too few corners, "

@@ -12,7 +12,12 @@ from bikeped.errors import BikepedError
 from bikeped.lab.cli import conformance_governance as governance
 from bikeped.lab.governance import register
 from bikeped.lab.governance.audit_records import write_audit
-from bikeped.lab.governance.contest import apply_bounds, contest, parse_truth, with_scenarios
+from bikeped.lab.governance.what_if import (
+    apply_bounds,
+    compare_variants,
+    parse_truth,
+    with_scenarios,
+)
 from bikeped.lab.scenarios.scenario import parse_scenario
 from bikeped.lab.simulation.suite import DEFAULT_GROUND_TRUTH, Suite
 from bikeped.types import State
@@ -44,7 +49,7 @@ def suite(loaded):
 
 
 def test_contest_gives_the_numbers_of_direct_runs(suite):
-    found = contest(suite, DecisionConfig(), suite, WEAK).as_dict()
+    found = compare_variants(suite, DecisionConfig(), suite, WEAK).as_dict()
     for key, decision in (("before", DecisionConfig()), ("after", WEAK)):
         metrics, states = suite.measure(decision), suite.states(decision)
         assert found[key]["totals"] == metrics.as_dict()
@@ -58,7 +63,7 @@ def test_contest_gives_the_numbers_of_direct_runs(suite):
 
 
 def test_changed_frames_and_spans_are_those_of_the_states(suite):
-    found = contest(suite, DecisionConfig(), suite, WEAK)
+    found = compare_variants(suite, DecisionConfig(), suite, WEAK)
     before, after = suite.states(DecisionConfig()), suite.states(WEAK)
     by_name = {c["scenario"]: c for c in found.changed}
     for i, name in enumerate(suite.names):
@@ -81,14 +86,14 @@ def test_changed_frames_and_spans_are_those_of_the_states(suite):
 
 
 def test_nothing_changes_against_itself(suite):
-    assert contest(suite, WEAK, suite, WEAK).changed == []
+    assert compare_variants(suite, WEAK, suite, WEAK).changed == []
 
 
 def test_truth_changes_labels_and_not_states(suite):
     other = suite.with_truth(
         parse_truth(DEFAULT_GROUND_TRUTH, ["cpa_radius_m=0.5", "braking=ebike"])
     )
-    found = contest(suite, DecisionConfig(), other, DecisionConfig())
+    found = compare_variants(suite, DecisionConfig(), other, DecisionConfig())
     assert found.changed
     assert all(c["frames_state"] == 0 and c["frames_truth"] > 0 for c in found.changed)
     assert found.as_dict()["after"]["truth"]["braking"] == "ebike"
@@ -99,7 +104,7 @@ def test_scenarios_are_added_and_replaced(suite):
     changed = parse_scenario(ONE.replace("32.0", "25.0"), "one")
     other = with_scenarios(suite, [new, changed])
     assert other.names == (*suite.names, "Three")
-    found = contest(suite, DecisionConfig(), other, DecisionConfig())
+    found = compare_variants(suite, DecisionConfig(), other, DecisionConfig())
     assert {c["scenario"]: c["what"] for c in found.changed} == {
         "One": "replaced scenario",
         "Three": "new scenario",
@@ -210,7 +215,7 @@ def test_another_camera_counts_for_the_side_after_only(tmp_path):
 
 
 def test_the_register_holds_the_suite_s_figures_and_the_paper_s_hazards(suite):
-    found = register.build(suite, DecisionConfig())
+    found = register.build_register(suite, DecisionConfig())
     metrics = suite.measure(DecisionConfig())
     for i, row in enumerate(found.scenarios):
         assert row["scenario"] == suite.names[i]
@@ -230,14 +235,14 @@ def test_danger_without_any_alert_blocks(loaded):
     text = ONE.replace("One", "Swerving One")
     small = Suite.load([parse_scenario(text, "x")], loaded)
     deaf = DecisionConfig(d_min_m=0.5, d_max_m=0.6, speed_adaptive=False)
-    found = register.build(small, deaf)
+    found = register.build_register(small, deaf)
     assert found.scenarios[0]["field_blocking"] == "yes"
     assert found.hazards[0]["field_blocking"] == "yes"
     assert found.hazards[0]["scenarios"] == ["Swerving One"]
 
 
 def test_markdown_keeps_names_from_breaking_the_table(suite):
-    lines = register.build(suite, DecisionConfig()).markdown().splitlines()
+    lines = register.build_register(suite, DecisionConfig()).markdown().splitlines()
     row = next(line for line in lines if "Two" in line)
     assert "Two \\<b\\>\\&\\|" in row
     header = next(line for line in lines if line.startswith("| Scenario |"))

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from bikeped.config import DecisionConfig
 from bikeped.config.provenance import decision_hash
 from bikeped.errors import BikepedError, ScenarioError
-from bikeped.lab.governance.gates import all_hold, check
+from bikeped.lab.governance.gates import all_hold, check_gates
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
 from bikeped.lab.simulation.metrics import Metrics, finite_or_none
 from bikeped.lab.simulation.suite import Suite
@@ -29,7 +29,7 @@ _TRUTH_RANGE = {"cpa_radius_m": 25.0, "stopping_margin": 10.0, "ttc_bound_s": 60
 
 
 @dataclass(frozen=True)
-class Side:
+class Variant:
     """One side of the comparison: a suite, a decision, and what they give."""
 
     suite: Suite
@@ -38,8 +38,8 @@ class Side:
     metrics: Metrics
 
     @staticmethod
-    def of(suite: Suite, decision: DecisionConfig) -> Side:
-        return Side(suite, decision, suite.states(decision), suite.measure(decision))
+    def of(suite: Suite, decision: DecisionConfig) -> Variant:
+        return Variant(suite, decision, suite.states(decision), suite.measure(decision))
 
     def part(self, name: str) -> slice:
         """Where a scenario's frames lie."""
@@ -54,8 +54,8 @@ class Side:
             "decision_hash": decision_hash(self.decision),
             "truth": truth_dict(self.suite.truth_settings),
             "totals": self.metrics.as_dict(),
-            "gates": [gate.as_dict() for gate in check(self.metrics)],
-            "promotable": all_hold(check(self.metrics)),
+            "gates": [gate.as_dict() for gate in check_gates(self.metrics)],
+            "promotable": all_hold(check_gates(self.metrics)),
             "by_scenario": {
                 name: {"states": self._shares(name), **self.metrics.scenario_dict(i)}
                 for i, name in enumerate(self.suite.names)
@@ -68,11 +68,11 @@ class Side:
 
 
 @dataclass(frozen=True)
-class Contest:
+class Comparison:
     """Before and after, and what changed between them."""
 
-    before: Side
-    after: Side
+    before: Variant
+    after: Variant
     changed: list[dict[str, Any]]
 
     def as_dict(self) -> dict[str, Any]:
@@ -83,11 +83,11 @@ class Contest:
         }
 
 
-def contest(
+def compare_variants(
     before: Suite, decision: DecisionConfig, after: Suite, other: DecisionConfig
-) -> Contest:
+) -> Comparison:
     """Runs both sides and lists every scenario that is new or in which anything changed."""
-    old, new = Side.of(before, decision), Side.of(after, other)
+    old, new = Variant.of(before, decision), Variant.of(after, other)
     scripts = {s.name: dump_scenario(s) for s in before.scenarios}
     changed = []
     for index, scenario in enumerate(after.scenarios):
@@ -102,7 +102,7 @@ def contest(
                 changed.append(entry)
             continue
         changed.append({"scenario": name, "what": what, "frames": len(after.truths[index].time_s)})
-    return Contest(old, new, changed)
+    return Comparison(old, new, changed)
 
 
 def with_scenarios(suite: Suite, added: Sequence[Scenario]) -> Suite:
@@ -125,7 +125,9 @@ def parse_truth(settings: GroundTruthSettings, items: Sequence[str]) -> GroundTr
             raise BikepedError(f"{said}: expected KEY=VALUE, e.g. --truth cpa_radius_m=7")
         if key == "braking":
             if text not in BRAKING_PROFILES:
-                raise BikepedError(f"{said}: unknown profile; use one of {', '.join(BRAKING_PROFILES)}")
+                raise BikepedError(
+                    f"{said}: unknown profile; use one of {', '.join(BRAKING_PROFILES)}"
+                )
             settings = replace(settings, braking=text)
         elif key in _TRUTH_RANGE:
             value = _float(text, said)
@@ -188,7 +190,7 @@ def truth_dict(settings: GroundTruthSettings) -> dict[str, Any]:
     }
 
 
-def _differences(old: Side, new: Side, name: str, index: int) -> dict[str, Any]:
+def _differences(old: Variant, new: Variant, name: str, index: int) -> dict[str, Any]:
     """What differs in a scenario whose script is the same on both sides."""
     before, after = old.states[old.part(name)], new.states[new.part(name)]
     truth, truth_new = old.suite.truths[old.suite.names.index(name)], new.suite.truths[index]
