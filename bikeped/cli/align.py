@@ -5,12 +5,19 @@ from __future__ import annotations
 import itertools
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 import msgspec
 
-from bikeped.cli.common import FiniteRange, config_options, console, json_option, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    console,
+    json_option,
+    text_table,
+    write_json,
+)
 from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, framing, ground_camera, load_config
 from bikeped.errors import BikepedError, CaptureError
@@ -178,32 +185,28 @@ def _save(loaded: LoadedConfig, found: Fit) -> Saved:
 
 def _print(found: Fit, saved: Saved | None) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
     from bikeped.geometry.alignment import PARAMETERS
 
     screen = console()
-    numbers = Table(box=None, pad_edge=False)
-    for name in ("", "fitted", "+/-"):
-        numbers.add_column(name, justify="left" if name == "" else "right")
+    fitted = []
     for key, error in found.error.items():
-        value: Any = getattr(found.alignment, key)
-        numbers.add_row(f"{PARAMETERS[key]} (camera.{key})", f"{value:.4f}", f"{error:.4f}")
-    screen.print(numbers)
-    marks = Table(box=None, pad_edge=False)
-    for name in ("mark", "what", "measured m", "reads m", "off cm", ""):
-        marks.add_column(name, justify="right" if " " in name else "left")
-    for r in found.residuals:
-        note = "look again" if r.strange else ""
-        marks.add_row(
-            escape(r.mark),
+        value = getattr(found.alignment, key)
+        fitted.append((f"{PARAMETERS[key]} (camera.{key})", f"{value:.4f}", f"{error:.4f}"))
+    screen.print(text_table(("", "fitted", "+/-"), fitted))
+    residuals = [
+        (
+            r.mark,
             r.what,
             f"{r.measured_m:.2f}",
             f"{r.read_m:.2f}",
             f"{100 * r.off_m:+.1f}",
-            note,
+            "look again" if r.strange else "",
         )
-    screen.print(marks)
+        for r in found.residuals
+    ]
+    columns = ("mark", "what", "measured m", "reads m", "off cm", "")
+    screen.print(text_table(columns, residuals, align="llrrrl"))
     if found.at_10m_error_m is not None:
         screen.print(f"a mark at 10 m reads 10 m +/- {100 * found.at_10m_error_m:.0f} cm")
     if not found.spare:

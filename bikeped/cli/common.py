@@ -9,7 +9,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -19,6 +19,8 @@ from bikeped.files import write_whole
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -78,6 +80,39 @@ def console(json_path: str | None = None) -> Console:
     if not screen.is_terminal:
         screen.width = 250  # a file or a pipe is as wide as the table needs
     return screen
+
+
+def text_table(
+    columns: Sequence[str],
+    rows: Iterable[Iterable[str | Text]],
+    *,
+    align: str = "",
+    title: str = "",
+    note: str = "",
+) -> Table:
+    """A table for a terminal or a file, without rules. A text cell is printed as it is, never read
+    as markup; a rich Text keeps its style.
+
+    `align` has one letter a column, `l` or `r`; default: the first left, the others right.
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(
+        title=escape(title) or None,
+        title_justify="left",
+        caption=escape(note) or None,
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+        show_header=any(columns),
+    )
+    sides = align or "l" + "r" * (len(columns) - 1)
+    for name, side in zip(columns, sides, strict=True):
+        table.add_column(escape(name), justify="left" if side == "l" else "right")
+    for row in rows:
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
+    return table
 
 
 @contextlib.contextmanager

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.table import Table
 
-from bikeped.cli.common import config_options, console, json_option, write_json
+from bikeped.cli.common import config_options, console, json_option, text_table, write_json
 from bikeped.cli.guard import guarded
 from bikeped.config import default_config_path, load_config
 from bikeped.errors import BikepedError
@@ -34,7 +33,7 @@ def command(
     json_path: str | None,
 ) -> int:
     """Check camera, model, light, speaker, broker, clock and disk; 1 when one of them fails."""
-    from bikeped.pipeline.doctor import Finding, checks, examine
+    from bikeped.pipeline.doctor import Finding, checks, run_checks
 
     file = config_path or default_config_path()
     findings: list[Finding] = []
@@ -48,14 +47,15 @@ def command(
         todo = checks(light=not no_light, sound=not no_sound)
         screen = console("-")  # what is going on, where no JSON goes
         with screen.status("checking") as status:
-            for check, finding in zip(todo, examine(loaded, todo), strict=True):
+            for check, finding in zip(todo, run_checks(loaded, todo), strict=True):
                 findings.append(finding)
                 status.update(f"checking, {check.name} done")
     failed = any(finding.status == "fail" for finding in findings)
     report = {
         "ok": not failed,
         "source": str(file),
-        "checks": [dataclasses.asdict(finding) for finding in findings],
+        # `mend` is the name that `remedy` had in the first release.
+        "checks": [{**dataclasses.asdict(f), "mend": f.remedy} for f in findings],
     }
     if json_path is not None:
         write_json(report, json_path)
@@ -65,16 +65,14 @@ def command(
 
 
 def _print(findings: list[Finding]) -> None:
-    table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    for finding in findings:
-        text = finding.detail + (f"\n-> {finding.mend}" if finding.mend else "")
-        table.add_row(f"[{_STYLES[finding.status]}]{finding.status}[/]", finding.name, _plain(text))
-    console().print(table)
+    from rich.text import Text
 
-
-def _plain(text: str) -> str:
-    """Text in which rich finds no markup."""
-    return text.replace("[", "\\[")
+    rows = [
+        (
+            Text(finding.status, _STYLES[finding.status]),
+            finding.name,
+            finding.detail + (f"\n-> {finding.remedy}" if finding.remedy else ""),
+        )
+        for finding in findings
+    ]
+    console().print(text_table(("", "", ""), rows, align="lll"))

@@ -1,4 +1,4 @@
-"""`bikeped replay`: a recorded video through the very same loop."""
+"""`bikeped replay`: a recorded video through the service's loop."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
-from rich.table import Table
 
 from bikeped.cli.common import (
     config_options,
     console,
     json_option,
     progress_bar,
+    text_table,
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded
@@ -22,6 +21,8 @@ from bikeped.config import load_config
 from bikeped.files import make_folder
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from bikeped.pipeline.replay import ReplayResult
 
 
@@ -82,7 +83,7 @@ def command(
     if json_path is not None:
         write_json(summary, json_path)
     if json_path != "-":
-        print_result(console(), result)
+        _print_result(console(), result)
         for path in (overlay, events, None if out is None else out / "summary.json"):
             if path is not None:
                 click.echo(f"wrote {path}")
@@ -100,7 +101,7 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def print_result(screen: Console, result: ReplayResult) -> None:
+def _print_result(screen: Console, result: ReplayResult) -> None:
     """The summary for people."""
     data = result.as_dict()
     screen.print(
@@ -118,10 +119,9 @@ def print_result(screen: Console, result: ReplayResult) -> None:
         screen.print(
             f"  {alert['t']:7.2f} s  {alert['sentence']} ({counted(alert['frames'], 'frame')})"
         )
-    table = Table(title="latency, ms", title_justify="left", box=None, pad_edge=False)
-    table.add_column("stage")
-    for name in ("mean", "p50", "p95", "p99", "max"):
-        table.add_column(name, justify="right")
-    for stage, row in data["latency_ms"].items():
-        table.add_row(stage, *(f"{row[n]:.2f}" for n in ("mean", "p50", "p95", "p99", "max")))
-    screen.print(table)
+    columns = ("mean", "p50", "p95", "p99", "max")
+    rows = [
+        (stage, *(f"{row[name]:.2f}" for name in columns))
+        for stage, row in data["latency_ms"].items()
+    ]
+    screen.print(text_table(("stage", *columns), rows, title="latency, ms"))

@@ -49,12 +49,12 @@ MB = 1_000_000
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found; `mend` says what to do."""
+    """What one check found; `remedy` says what to do."""
 
     name: str
     status: Status
     detail: str
-    mend: str = ""
+    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def checks(*, light: bool = True, sound: bool = True) -> tuple[Check, ...]:
     )
 
 
-def examine(loaded: LoadedConfig, todo: tuple[Check, ...]) -> Iterator[Finding]:
+def run_checks(loaded: LoadedConfig, todo: tuple[Check, ...]) -> Iterator[Finding]:
     """The findings one by one. A check that hangs is left behind in its thread."""
     for check in todo:
         yield _bounded(check, loaded)
@@ -292,14 +292,14 @@ def check_clock(_loaded: LoadedConfig) -> Finding:
     """Whether time stamps in messages and logs can be right."""
     now = dt.datetime.now(dt.timezone.utc)
     text = f"{now:%Y-%m-%d %H:%M} UTC"
-    mend = "timedatectl set-ntp true; is there a network, or a battery for the clock?"
+    remedy = "timedatectl set-ntp true; is there a network, or a battery for the clock?"
     if now.year < LEAST_YEAR:
-        return Finding("clock", "warn", f"{text}: was never set", mend)
+        return Finding("clock", "warn", f"{text}: was never set", remedy)
     synchronised = _said_by("timedatectl", "show", "--property=NTPSynchronized", "--value")
     if synchronised is None:
         return Finding("clock", "ok", f"{text}; synchronisation unknown (no timedatectl)")
     if synchronised != "yes":
-        return Finding("clock", "warn", f"{text}, not synchronised", mend)
+        return Finding("clock", "warn", f"{text}, not synchronised", remedy)
     return Finding("clock", "ok", f"{text}, synchronised")
 
 
@@ -376,19 +376,19 @@ def _said_by(program: str, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _held_by_service(name: str, detail: str, mend: str) -> Finding:
+def _held_by_service(name: str, detail: str, remedy: str) -> Finding:
     """A device that cannot be had: no failure where it is the running service that has it."""
     if _said_by("systemctl", "is-active", "bikeped") == "active":
         return Finding(
             name, "warn", detail, "the running service may hold it: systemctl stop bikeped"
         )
-    return Finding(name, "fail", detail, mend)
+    return Finding(name, "fail", detail, remedy)
 
 
 def _split(message: str) -> tuple[str, str]:
     """An error's message as what is wrong, and what mends it: they are parted by a semicolon."""
-    detail, _, mend = " ".join(message.split()).partition("; ")
-    return detail, mend
+    detail, _, remedy = " ".join(message.split()).partition("; ")
+    return detail, remedy
 
 
 def _left_out(name: str, option: str) -> Callable[[LoadedConfig], Finding]:

@@ -165,6 +165,7 @@ def test_doctor_says_what_to_do_and_fails_only_for_what_the_service_needs(
         "name": "model",
         "status": "fail",
         "detail": "no such file",
+        "remedy": "name one",
         "mend": "name one",
     }
 

@@ -11,7 +11,7 @@ import pytest
 from bikeped.config import load_config
 from bikeped.errors import CaptureError, FeedbackError
 from bikeped.pipeline import doctor
-from bikeped.pipeline.doctor import Check, Finding, checks, examine
+from bikeped.pipeline.doctor import Check, Finding, checks, run_checks
 from bikeped.types import Colour, Frame
 
 PATIENCE_S = 20.0
@@ -76,11 +76,11 @@ def test_a_slow_camera_is_a_warning(camera, small_config):
     finding = doctor.check_camera(load_config(small_config()))
     assert finding.status == "warn"
     assert "12.0 frames/s" in finding.detail
-    assert "camera.fps asks for 30" in finding.mend
+    assert "camera.fps asks for 30" in finding.remedy
 
 
 def found_by(function, config, name="camera"):
-    (finding,) = examine(config, (Check(name, function, PATIENCE_S),))
+    (finding,) = run_checks(config, (Check(name, function, PATIENCE_S),))
     return finding
 
 
@@ -98,7 +98,7 @@ def test_a_camera_whose_pictures_are_of_no_use_fails(camera, small_config, value
 def test_a_missing_camera_fails_with_its_mend(small_config):
     finding = doctor.check_camera(load_config(small_config("/dev/video-none")))
     assert (finding.status, finding.detail) == ("fail", "/dev/video-none: no such camera")
-    assert "plug it in" in finding.mend
+    assert "plug it in" in finding.remedy
 
 
 def test_what_the_running_service_holds_is_a_warning(small_config, monkeypatch):
@@ -110,7 +110,7 @@ def test_what_the_running_service_holds_is_a_warning(small_config, monkeypatch):
     monkeypatch.setattr(doctor, "open_source", busy)
     finding = doctor.check_camera(load_config(small_config()))
     assert finding.status == "warn"
-    assert "systemctl stop bikeped" in finding.mend
+    assert "systemctl stop bikeped" in finding.remedy
 
 
 def test_a_recording_in_the_cameras_place_is_a_warning(make_clip, small_config):
@@ -178,7 +178,7 @@ def test_a_light_that_fails_midway_is_darkened(small_config, monkeypatch):
     lamps = Breaks()
     monkeypatch.setattr(doctor, "open_light", lambda feedback: lamps)
     finding = doctor.check_light(load_config(small_config()))
-    assert (finding.status, finding.mend) == ("fail", "check the cable")
+    assert (finding.status, finding.remedy) == ("fail", "check the cable")
     assert lamps.closed
 
 
@@ -191,7 +191,7 @@ def test_the_speaker(small_config, monkeypatch):
     assert doctor.check_speaker(load_config(off)).status == "skipped"
     monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
     finding = doctor.check_speaker(load_config(off, on))
-    assert (finding.status, finding.mend) == ("fail", "apt-get install alsa-utils")
+    assert (finding.status, finding.remedy) == ("fail", "apt-get install alsa-utils")
     monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(doctor.subprocess, "run", speaker(0))
     assert doctor.check_speaker(load_config(off, on)).status == "ok"
@@ -210,7 +210,7 @@ def test_the_broker(small_config, broker):
     found[1] = "mqtt.port=9"
     finding = doctor.check_broker(load_config(config, found))
     assert finding.status == "warn"
-    assert "mqtt.host" in finding.mend
+    assert "mqtt.host" in finding.remedy
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_the_clock(year, said, status, small_config, monkeypatch):
     finding = doctor.check_clock(load_config(small_config()))
     assert finding.status == status
     assert str(year) in finding.detail
-    assert bool(finding.mend) == (status == "warn")
+    assert bool(finding.remedy) == (status == "warn")
 
 
 def test_the_disk(small_config, tmp_path, monkeypatch):
@@ -280,7 +280,7 @@ def test_a_check_that_hangs_or_breaks_does_not_end_the_others(small_config):
         Check("works", lambda loaded: Finding("works", "ok", "fine"), PATIENCE_S),
     )
     try:
-        found = list(examine(load_config(small_config()), todo))
+        found = list(run_checks(load_config(small_config()), todo))
     finally:
         go.set()
     assert [(f.name, f.status) for f in found] == [
