@@ -8,11 +8,13 @@ ground below the lens). Arrays run in parallel; `check` functions state expected
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from bikeped.faults import Fault
 
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
@@ -233,7 +235,7 @@ class Signal:
     colour: Colour
     blink_hz: float = 0.0  #: 0 is steady
     sound: Sound = Sound.NONE
-    faults: tuple[str, ...] = field(default=())  #: why the signal is FAULT, one line each
+    faults: tuple[Fault, ...] = ()  #: what is wrong now; not empty when the signal is FAULT
 
 
 def _expect(name: str, array: npt.NDArray[Any], shape: tuple[int, ...]) -> None:

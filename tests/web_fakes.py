@@ -10,6 +10,7 @@ import simplejpeg
 from prometheus_client import CollectorRegistry
 
 from bikeped.config import LoadedConfig, parse_config
+from bikeped.faults import Fault
 from bikeped.pipeline.detection_stage import Picture
 from bikeped.pipeline.loop import Outcome
 from bikeped.pipeline.track_and_decide import Judge
@@ -33,12 +34,13 @@ camera: {width: 960, height: 640, projection: perspective, pad_size: null, crop_
 web: {enabled: true, port: 0}
 """
 
+NO_FRAME = Fault("camera", "camera.no_frame", "no frame for 2.0 s")
 SIGNALS = {
     "IDLE": Signal("IDLE", Colour.BLUE),
     "SAFE": Signal("SAFE", Colour.GREEN),
     "WARNING": Signal("WARNING", Colour.ORANGE),
     "ALERT": Signal("ALERT", Colour.RED, blink_hz=2.0),
-    "FAULT": Signal("FAULT", Colour.ORANGE, 0.5, faults=("camera: no frame for 2.0 s",)),
+    "FAULT": Signal("FAULT", Colour.ORANGE, 0.5, faults=(NO_FRAME,)),
     "OFF": Signal("OFF", Colour.OFF),
 }
 

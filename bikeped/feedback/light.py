@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
 
 from bikeped.errors import FeedbackError
+from bikeped.faults import Fault
 from bikeped.feedback.signal import fault_signal
 from bikeped.types import Colour, Signal
 
@@ -27,8 +28,8 @@ _T = TypeVar("_T")
 #: A GPIO line by name or offset, or a relay by number; None is not wired.
 Lamp = str | int | None
 
-#: The fault of a light that nobody refreshes; a text for people and for telemetry.
-DEADMAN = "light: not refreshed by the service"
+#: The fault of a light that the service has not set for `deadman_s`.
+NOT_REFRESHED = Fault("light", "light.not_refreshed", "not refreshed by the service")
 
 LAMP_COLOURS = (Colour.RED, Colour.ORANGE, Colour.GREEN, Colour.BLUE)
 
@@ -117,7 +118,7 @@ class LightDriver:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._open_light = open_light
-        self._deadman_signal = fault_signal((DEADMAN,), fault_blink_hz)
+        self._deadman_signal = fault_signal((NOT_REFRESHED,), fault_blink_hz)
         self._deadman_s = deadman_s
         self._hang_s = hang_s
         self._assert_s = assert_s
@@ -130,7 +131,7 @@ class LightDriver:
         self._shown_s = clock()
         self._closing = False
         self._busy_since: float | None = None
-        self._error: str | None = None
+        self._error: Fault | None = None
         self._errors = 0
         self._deadman_trips = 0
 
@@ -164,13 +165,15 @@ class LightDriver:
                 self._changed.notify()
 
     @property
-    def fault(self) -> str | None:
+    def fault(self) -> Fault | None:
         """What is wrong with the light now, for health and the log; None when it obeys."""
         with self._changed:
             if self._thread is not None and not self._thread.is_alive() and not self._closing:
-                return "light: its thread has ended; restart the service"
+                return _fault("light.thread_ended", "its thread has ended; restart the service")
             if self._busy_since is not None and self._clock() - self._busy_since > self._hang_s:
-                return f"light: the device has not answered for more than {self._hang_s:g} s"
+                return _fault(
+                    "light.hang", f"the device has not answered for more than {self._hang_s:g} s"
+                )
             return self._error
 
     @property
@@ -224,7 +227,7 @@ class LightDriver:
         # Logged outside the lock: a log that blocks must not block `show`.
         if self._deadman and not was:
             self._deadman_trips += 1
-            _log.error("%s for %g s; the light shows FAULT", DEADMAN, self._deadman_s)
+            _log.error("%s for %g s; the light shows FAULT", NOT_REFRESHED, self._deadman_s)
         elif was and not self._deadman:
             _log.warning("light: refreshed again after the deadman had tripped")
         if stale or signal is None:
@@ -246,7 +249,7 @@ class LightDriver:
             return self._failed(str(error), now_s)
         except Exception as error:  # noqa: BLE001 - a bug must not end the deadman's thread
             _log.debug("light: unexpected error", exc_info=True)
-            return self._failed(f"light: {type(error).__name__}: {error}", now_s)
+            return self._failed(f"{type(error).__name__}: {error}", now_s)
         self._succeeded()
         self._applied, self._applied_s = colour, now_s
         return now_s + self._assert_s
@@ -268,12 +271,13 @@ class LightDriver:
             with self._changed:
                 self._error = None
 
-    def _failed(self, text: str, now_s: float) -> float:
+    def _failed(self, detail: str, now_s: float) -> float:
+        fault = _fault("light.error", detail)
         with self._changed:
-            known, self._error = self._error, text
+            known, self._error = self._error, fault
             self._errors += 1
-        if text != known:
-            _log.error("%s", text)
+        if fault != known:
+            _log.error("%s", fault)
         self._release()
         self._applied = None
         self._retry_at_s = now_s + self._pause_s
@@ -315,6 +319,10 @@ class LightDriver:
         if signal is None or self._clock() - self._shown_s >= self._deadman_s:
             signal = self._deadman_signal
         return _pattern_of(signal) != self._pattern
+
+
+def _fault(code: str, detail: str) -> Fault:
+    return Fault("light", code, detail)
 
 
 def _pattern_of(signal: Signal) -> tuple[Colour, float]:

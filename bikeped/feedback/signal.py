@@ -28,20 +28,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from bikeped.faults import Fault
 from bikeped.types import Colour, Signal, Sound, State
 
 if TYPE_CHECKING:
     from bikeped.config import FeedbackConfig
 
 #: What `Signal.faults` says before the first good frames came.
-STARTING = "starting: not enough good frames yet"
+STARTING = Fault("starting", "service.starting", "not enough good frames yet")
 
 OFF = Signal("OFF", Colour.OFF)
 
 _STEADY = {State.IDLE: Colour.BLUE, State.SAFE: Colour.GREEN, State.WARNING: Colour.ORANGE}
 
 
-def fault_signal(faults: tuple[str, ...], blink_hz: float) -> Signal:
+def fault_signal(faults: tuple[Fault, ...], blink_hz: float) -> Signal:
     """FAULT as the light shows it: orange, slowly blinking, never a steady colour.
 
     Raises ValueError when `blink_hz` is not above zero, for steady orange would say WARNING.
@@ -75,7 +76,7 @@ class SignalLogic:
         self._recover_frames = recover_frames
         self._good_frames = 0
         self._recovered = False
-        self._why: tuple[str, ...] = (STARTING,)
+        self._why: tuple[Fault, ...] = (STARTING,)
         self._alert_s: float | None = None
         self._state: State | None = None
         self._shown = "FAULT"
@@ -91,7 +92,7 @@ class SignalLogic:
         )
 
     def step(
-        self, now_s: float, decision_state: State | None, faults: tuple[str, ...] = ()
+        self, now_s: float, decision_state: State | None, faults: tuple[Fault, ...] = ()
     ) -> Signal:
         """The signal at `now_s`.
 
@@ -107,7 +108,7 @@ class SignalLogic:
         self._shown = signal.name
         return signal
 
-    def _learn(self, now_s: float, state: State | None, faults: tuple[str, ...]) -> None:
+    def _learn(self, now_s: float, state: State | None, faults: tuple[Fault, ...]) -> None:
         if state is State.ALERT:
             self._alert_s = now_s
         if faults:
@@ -120,7 +121,7 @@ class SignalLogic:
             if self._good_frames >= self._recover_frames:
                 self._recovered = True
 
-    def _choose(self, now_s: float, faults: tuple[str, ...]) -> Signal:
+    def _choose(self, now_s: float, faults: tuple[Fault, ...]) -> Signal:
         if self._alert_holds(now_s) or (
             not faults and self._recovered and self._state is State.ALERT
         ):
@@ -131,7 +132,7 @@ class SignalLogic:
         if not self._recovered or self._state is None:
             why = self._why
             if why != (STARTING,):
-                why = tuple(f"recovering: {line}" for line in why)
+                why = tuple(Fault("recovering", "service.recovering", str(fault)) for fault in why)
             return fault_signal(why, self._fault_blink_hz)
         return Signal(self._state.name, _STEADY[self._state])
 
@@ -153,40 +154,30 @@ def assess(
     last_answer_s: float | None,
     stale_after_s: float,
     silent_after_s: float,
-    *,
-    frame_size: tuple[int, int] | None = None,
-    table_size: tuple[int, int] | None = None,
-    explicit: tuple[str, ...] = (),
-) -> tuple[str, ...]:
+) -> tuple[Fault, ...]:
     """Why nothing that the pipeline says may be believed at `now_s`; empty when all is well.
 
     `last_frame_s` is the capture time of the newest frame and `last_answer_s` the capture time or
     the arrival of the newest detector answer, both on the clock of `now_s`, None before the first.
-    `frame_size` and `table_size` are (width, height) in pixels of the frame and of the frame that
-    the ground table was made for. `explicit` faults are passed on as they are.
-
-    The lines do not carry ages, so that a fault that lasts keeps one text and is logged once.
     """
-    faults: list[str] = []
-    _judge(faults, "camera: no frame", now_s, last_frame_s, stale_after_s)
-    _judge(faults, "detector: no answer", now_s, last_answer_s, silent_after_s)
-    if frame_size is not None and table_size is not None and frame_size != table_size:
-        faults.append(
-            f"geometry: the ground table is for {table_size[0]}x{table_size[1]} pixels, the "
-            f"frame has {frame_size[0]}x{frame_size[1]}"
-        )
-    return (*faults, *explicit)
+    return (
+        *_missing("camera", "frame", now_s, last_frame_s, stale_after_s),
+        *_missing("detector", "answer", now_s, last_answer_s, silent_after_s),
+    )
 
 
-def _judge(
-    faults: list[str], what: str, now_s: float, last_s: float | None, limit_s: float
-) -> None:
+def _missing(
+    source: str, what: str, now_s: float, last_s: float | None, limit_s: float
+) -> tuple[Fault, ...]:
+    """The fault of the newest `what` being too old, in the future, or not there yet."""
     if last_s is None:
-        faults.append(f"{what} yet")
-        return
+        return (Fault(source, f"{source}.no_{what}", f"no {what} yet"),)
     age_s = now_s - last_s
     # Written so that a NaN age is a fault, too.
     if not age_s <= limit_s:
-        faults.append(f"{what} for more than {limit_s:g} s")
-    elif age_s < -limit_s:
-        faults.append(f"{what} with a usable time: the newest lies in the future")
+        detail = f"no {what} for more than {limit_s:g} s"
+        return (Fault(source, f"{source}.no_{what}", detail),)
+    if age_s < -limit_s:
+        detail = f"no {what} with a usable time: the newest lies in the future"
+        return (Fault(source, f"{source}.future_time", detail),)
+    return ()

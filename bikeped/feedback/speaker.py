@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from bikeped.faults import Fault
 from bikeped.feedback.sounds import duration_s, load_wav, make_wav
 from bikeped.types import Sound
 
@@ -66,13 +67,13 @@ class Speaker:
         # The interrupted ones too, until their children have gone.
         self._tasks: set[asyncio.Task[None]] = set()
         self._playing = Sound.NONE
-        self._fault: str | None = None
+        self._fault: Fault | None = None
         self._failures = 0
         self._played = 0
 
     @property
-    def fault(self) -> str | None:
-        """Why the last sound was not heard, one line; None when it was, or none was asked for."""
+    def fault(self) -> Fault | None:
+        """Why the last sound was not heard; None when it was, or none was asked for."""
         return self._fault
 
     @property
@@ -136,9 +137,10 @@ class Speaker:
                 _log.warning("speaker: works again")
             self._fault = None
             return
-        if error != self._fault:
-            _log.error("%s", error)
-        self._fault = error
+        fault = Fault("speaker", "speaker.error", error)
+        if fault != self._fault:
+            _log.log(fault.kind.severity, "%s", fault)
+        self._fault = fault
         self._failures += 1
         # A broken card must not cost a process thirty times a second, whatever the cool-down.
         self._ready_s[sound] = max(self._ready_s[sound], self._clock() + self._retry_s)
@@ -155,11 +157,11 @@ class Speaker:
                     *self._command, stdin=stdin, stdout=asyncio.subprocess.DEVNULL, stderr=stderr
                 )
             except (OSError, ValueError, RuntimeError) as error:
-                return f"speaker: {program} cannot be run: {error}; install alsa-utils"
+                return f"{program} cannot be run: {error}; install alsa-utils"
             try:
                 await asyncio.wait_for(child.wait(), limit_s)
             except asyncio.TimeoutError:
-                return f"speaker: {program} hung for {limit_s:.1f} s and was killed"
+                return f"{program} hung for {limit_s:.1f} s and was killed"
             finally:
                 # Also on cancellation: no child outlives its sound.
                 await _end(child)
@@ -167,7 +169,7 @@ class Speaker:
                 return None
             stderr.seek(0)
             said = stderr.read(4096).decode("utf-8", "replace").strip().splitlines()
-        return f"speaker: {program} ended with {child.returncode}: {(said or ['no message'])[-1]}"
+        return f"{program} ended with {child.returncode}: {(said or ['no message'])[-1]}"
 
 
 def _memory_file(name: str, content: bytes = b"") -> BinaryIO:

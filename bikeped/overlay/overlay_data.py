@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from bikeped.faults import fault_texts
 from bikeped.geometry import Framing, GroundCamera
 from bikeped.types import Decision, Detections, FloatArray, Signal, State, Tracks
 
@@ -37,7 +38,7 @@ class OverlayData:
     def sentence(self) -> str:
         """Why, in one line: the faults when the light is FAULT, else the decision's sentence."""
         if self.shown_name == "FAULT" and self.signal is not None and self.signal.faults:
-            return "; ".join(self.signal.faults)
+            return "; ".join(fault_texts(self.signal.faults))
         return self.decision.sentence
 
     @property

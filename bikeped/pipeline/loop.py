@@ -25,6 +25,7 @@ from typing import Protocol
 
 from bikeped.detection.base import DetectorAnswer
 from bikeped.errors import BikepedError, CaptureError, GeometryError
+from bikeped.faults import Fault
 from bikeped.feedback import assess
 from bikeped.pipeline.detection_stage import Picture, Vision
 from bikeped.pipeline.feed import Feed
@@ -44,6 +45,10 @@ _WEIGHT = 0.2  #: of the newest duration in the usual one
 
 class Hung(Exception):  # noqa: N818  a state to leave, not an error of the user's
     """A thread that cannot be ended does not return: only a new process helps."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(str(fault))
+        self.fault = fault
 
 
 @dataclass(frozen=True)
@@ -125,9 +130,9 @@ class Loop:
         self._seldom = Seldom(log)
         self._stop = asyncio.Event()
         # What is wrong now; the first text of a row of failures stays, so that one row is one fault
-        self._geometry_fault: str | None = None
-        self._decode_fault: tuple[str, float] | None = None
-        self._detector_fault: tuple[str, float] | None = None
+        self._geometry_fault: Fault | None = None
+        self._decode_fault: tuple[Fault, float] | None = None
+        self._detector_fault: tuple[Fault, float] | None = None
         self._answered_s: float | None = None  # capture time of the newest frame answered
         self._first_s: float | None = None  # capture time of the first frame judged
         self._judged_s: float | None = None  # capture time of the newest frame judged
@@ -179,7 +184,7 @@ class Loop:
                 for task in done:
                     task.result()  # a failure of any of them ends the loop
         except Hung as hang:
-            self._announcer.step(self._clock(), None, (str(hang),))
+            self._announcer.step(self._clock(), None, (hang.fault,))
             raise
         except BaseException:
             self._announcer.off()
@@ -214,7 +219,7 @@ class Loop:
                 self.counts.undecodable += 1
                 self._seldom.warn("decode", f"frame {frame.number} is skipped: {error}")
                 self._decode_fault = self._decode_fault or (
-                    f"camera: frames do not decode ({error})",
+                    Fault("camera", "camera.undecodable", f"frames do not decode ({error})"),
                     self._clock(),
                 )
                 continue
@@ -265,7 +270,9 @@ class Loop:
         while free and (picture := slot.take()) is not None:
             misfit = self._misfit(picture.frame)
             if self._feed.live:
-                self._geometry_fault = None if misfit is None else f"geometry: {misfit}"
+                self._geometry_fault = (
+                    None if misfit is None else Fault("geometry", "camera.frame_size", str(misfit))
+                )
                 if misfit is not None:
                     self._show()
                     continue
@@ -301,7 +308,10 @@ class Loop:
                 self._seldom.warn("detector", f"frame {number} is skipped: {error}")
             else:
                 self._seldom.failure("detector", error)
-            self._detector_fault = self._detector_fault or (f"detector: {error}", self._clock())
+            self._detector_fault = self._detector_fault or (
+                Fault("detector", "detector.error", str(error)),
+                self._clock(),
+            )
             return None
         self._detector_fault = None
         return answer
@@ -369,21 +379,23 @@ class Loop:
         now_s = self._clock()
         self._announcer.step(now_s, None, self._faults(now_s))
 
-    def _faults(self, now_s: float) -> tuple[str, ...]:
+    def _faults(self, now_s: float) -> tuple[Fault, ...]:
         """Why the light must not trust the decision; empty when it may."""
         if not self._feed.live:
             return ()
         explicit = [self._geometry_fault] if self._geometry_fault else []
         error = self._feed.error()
         if error is not None:
-            explicit.append(f"camera: {error}")
-        faults = assess(
-            now_s,
-            self._feed.newest_s(now_s),
-            self._answered_s,
-            self._limits.stale_after_s,
-            self._limits.silent_after_s,
-            explicit=tuple(explicit),
+            explicit.append(Fault("camera", "camera.error", error))
+        faults = (
+            *assess(
+                now_s,
+                self._feed.newest_s(now_s),
+                self._answered_s,
+                self._limits.stale_after_s,
+                self._limits.silent_after_s,
+            ),
+            *explicit,
         )
         if not faults:  # one bad frame among good ones is no fault
             return ()
@@ -399,12 +411,16 @@ class Loop:
             self._on_tick()
             now_s = self._clock()
             if self._feed.hung_s(now_s) > limit_s:
-                raise Hung(f"camera: a read has not returned for {limit_s:g} s")
+                detail = f"a read has not returned for {limit_s:g} s"
+                raise Hung(Fault("camera", "camera.hang", detail))
             if max(worker.busy_s(now_s) for worker in workers) > limit_s:
-                raise Hung(f"detector: has not returned for {limit_s:g} s")
+                raise Hung(
+                    Fault("detector", "detector.hang", f"has not returned for {limit_s:g} s")
+                )
             # A GPU that has failed once may fail until the process ends.
             if self._detector_fault is not None and now_s - self._detector_fault[1] > limit_s:
-                raise Hung(f"{self._detector_fault[0]} (for {limit_s:g} s)")
+                detail = f"{self._detector_fault[0].detail} (for {limit_s:g} s)"
+                raise Hung(Fault("detector", "detector.failing", detail))
             if self._decode_fault is not None and (now_s - self._decode_fault[1] > RESTART_AFTER_S):
                 self._decode_fault = (self._decode_fault[0], now_s)
                 self._feed.restart()

@@ -28,7 +28,7 @@ from bikeped.pipeline.signal_dispatcher import Announcer
 from bikeped.pipeline.telemetry import Telemetry
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside, Pages, open_pages
-from bikeped.telemetry.builders import ComponentStatus, HealthMessage
+from bikeped.telemetry.builders import HealthMessage
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
 
@@ -184,10 +184,9 @@ async def _replay(
             outputs=outputs,
             looks_at_once=eye.at_once if isinstance(eye, ModelEye) else 1,
         )
-        part = ComponentStatus(ok=True, detail="simulated")
 
         def health() -> HealthMessage:
-            return telemetry.health(loop, part)
+            return telemetry.health(loop, "simulated")
 
         if pages is not None and metrics is not None:
             inside = Inside(

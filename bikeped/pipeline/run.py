@@ -15,6 +15,7 @@ from bikeped import __version__
 from bikeped.capture import FrameGrabber, FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
+from bikeped.faults import Fault
 from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_driver, open_speaker
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.detection_stage import Eye, Vision
@@ -30,20 +31,19 @@ from bikeped.pipeline.track_and_decide import Judge
 from bikeped.pipeline.web_context import Inside, Pages, open_pages
 from bikeped.pipeline.worker_threads import Worker
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.builders import ComponentStatus, HealthMessage
+from bikeped.telemetry.builders import HealthMessage
 from bikeped.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
-#: A stuck thread cannot be ended; systemd starts a fresh process on this status (EX_TEMPFAIL).
-EXIT_RESTART = 75
 #: Building an engine takes minutes; what takes longer than this has hung.
 LOAD_LIMIT_S = 1800.0
 _REFRESH_S = 0.25
+LOADING = Fault("starting", "service.starting", "loading the model")
 
 
 def run_service(loaded: LoadedConfig, *, eye: Eye | None = None, pages: Pages | None = None) -> int:
-    """The service until SIGTERM or SIGINT; its exit status: 0, or EXIT_RESTART.
+    """The service until SIGTERM or SIGINT; its exit status: 0, or that of the fault that ended it.
 
     `pages` is what `web` serves; None serves nothing.
 
@@ -132,13 +132,10 @@ async def _serve(
     )
 
     def health() -> HealthMessage:
-        faults = [_about("speaker", speaker.fault)] if speaker.fault else []
-        if audit is not None and audit.fault:
-            faults.append(_about("audit", audit.fault))
-        if light.fault:
-            faults.append(_about("light", light.fault))
-        part = ComponentStatus(ok=light.fault is None, detail=light.fault or config.feedback.light)
-        return telemetry.health(loop, part, tuple(faults))
+        faults = [fault for fault in (speaker.fault, light.fault) if fault is not None]
+        if audit is not None and audit.fault is not None:
+            faults.insert(0, Fault("audit", "audit.error", audit.fault))
+        return telemetry.health(loop, config.feedback.light, tuple(faults))
 
     if pages is not None and metrics is not None:
         inside = Inside(
@@ -164,7 +161,7 @@ async def _serve(
         await loop.run()
     except Hung as hang:
         log.critical("%s; ending so that a fresh process can start", hang)
-        return EXIT_RESTART
+        return hang.fault.kind.exit_status or 0
     finally:
         notifier.stopping()
         for task in tasks:
@@ -197,7 +194,7 @@ async def _load_while_alive(
     None when the service was asked to stop before. Past LOAD_LIMIT_S systemd is no longer asked for
     patience, and ends the process.
     """
-    starting = fault_signal(("starting: loading the model",), loaded.config.feedback.fault_blink_hz)
+    starting = fault_signal((LOADING,), loaded.config.feedback.fault_blink_hz)
     worker = Worker("load")
     loading = worker.submit(load_eye, loaded)
     stopping = asyncio.create_task(stop.wait())
@@ -233,8 +230,3 @@ async def _darken(light: LightDriver) -> None:
         log.info("stopped: the light is off")
     else:
         log.error("stopped, but the light does not answer and may still be on")
-
-
-def _about(part: str, text: str) -> str:
-    """`text` with the part that it is about, once."""
-    return text if text.startswith(part) else f"{part}: {text}"

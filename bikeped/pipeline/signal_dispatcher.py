@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from typing import Protocol
 
+from bikeped.faults import Fault, fault_texts
 from bikeped.feedback import OFF, LightDriver, SignalLogic, Speaker
 from bikeped.pipeline.rate_limited_log import Seldom
 from bikeped.types import Decision, Signal
@@ -41,13 +42,15 @@ class Announcer:
         self._seldom = Seldom(log)
         self.shown: Signal | None = None
 
-    def step(self, now_s: float, decision: Decision | None, faults: tuple[str, ...] = ()) -> Signal:
+    def step(
+        self, now_s: float, decision: Decision | None, faults: tuple[Fault, ...] = ()
+    ) -> Signal:
         """Shows what `decision` (None: no new one) and `faults` lead to at `now_s`."""
         if decision is not None:
             self._decision = decision
         signal = self._logic.step(now_s, None if decision is None else decision.state, faults)
         if signal.name == "FAULT" or self._decision is None:
-            self._tell(signal, "; ".join(signal.faults))
+            self._tell(signal, "; ".join(fault_texts(signal.faults)))
         else:
             self._tell(signal, self._decision.sentence)
         return signal

@@ -12,6 +12,7 @@ import msgspec
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig
+from bikeped.faults import Component, Fault, fault_texts
 from bikeped.pipeline.loop import Loop, Outcome
 from bikeped.pipeline.track_and_decide import Judge
 from bikeped.telemetry.audit import AuditLog
@@ -56,7 +57,7 @@ class Telemetry:
         self._wall, self._clock = wall_clock, clock
         self.times = StageTimes(remember)
         self.alerts = 0
-        self._shown: tuple[str, tuple[str, ...]] | None = None
+        self._shown: tuple[str, tuple[Fault, ...]] | None = None
         self._next_tracks_s = -math.inf
         self._started_s = clock()
         self._recent: deque[float] = deque(maxlen=240)  # when frames were judged
@@ -113,14 +114,13 @@ class Telemetry:
         now_s = self._clock()
         return sum(now_s - at_s <= 2.0 for at_s in self._recent) / 2.0
 
-    def health(
-        self, loop: Loop, light: ComponentStatus, faults: tuple[str, ...] = ()
-    ) -> HealthMessage:
-        """The health message now; `faults` are those that the light does not show."""
+    def health(self, loop: Loop, light: str, faults: tuple[Fault, ...] = ()) -> HealthMessage:
+        """The health message now; `faults` are those that the light does not show.
+
+        `light` names the kind of light, as `feedback.light` does.
+        """
         signal = self._signal
         faults = (*(signal.faults if signal else ()), *faults)
-        camera = [fault for fault in faults if fault.startswith(("camera", "geometry"))]
-        detector = [fault for fault in faults if fault.startswith("detector")]
         age_s = loop.frame_age_s()
         age_ms = None if age_s is None else age_s * 1e3
         if age_ms is None and self._last is not None:
@@ -133,10 +133,10 @@ class Telemetry:
             uptime_s=self._clock() - self._started_s,
             fps=self.fps(),
             latency_ms=self.times.percentiles(),
-            camera=ComponentStatus(ok=not camera, detail="; ".join(camera) or "frames arrive"),
+            camera=_status("camera", faults, "frames arrive"),
             capture_age_ms=age_ms,
-            detector=ComponentStatus(ok=not detector, detail="; ".join(detector) or "answers"),
-            light=light,
+            detector=_status("detector", faults, "answers"),
+            light=_status("light", faults, light),
             faults=faults,
             counters=self._counters(loop),
         )
@@ -196,6 +196,12 @@ def event_line_for(outcome: Outcome) -> EventLine:
 def to_mapping(message: msgspec.Struct) -> Mapping[str, Any]:
     """A message as plain keys and values, for the HTTP server."""
     return cast(Mapping[str, Any], msgspec.to_builtins(message))
+
+
+def _status(name: Component, faults: tuple[Fault, ...], detail: str) -> ComponentStatus:
+    """Status of one component: its faults, or `detail` where it has none."""
+    texts = fault_texts(fault for fault in faults if fault.kind.component == name)
+    return ComponentStatus(ok=not texts, detail="; ".join(texts) or detail)
 
 
 def _shown(signal: Signal) -> ShownState:

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import TelemetryError
+from bikeped.faults import Fault, fault_texts
 from bikeped.telemetry.schema import (
     Availability,
     CameraHealth,
@@ -182,7 +183,7 @@ def health_message(
     capture_age_ms: float | None,
     detector: ComponentStatus,
     light: ComponentStatus,
-    faults: Iterable[str],
+    faults: Sequence[Fault],
     counters: Counters,
 ) -> HealthMessage:
     """The health message at `unix_s`; `latency_ms` is what `StageTimes.percentiles` returns."""
@@ -206,7 +207,8 @@ def health_message(
         ),
         detector=detector,
         light=light,
-        faults=list(faults),
+        faults=list(fault_texts(faults)),
+        fault_codes=[fault.code for fault in faults],
         counters=counters,
     )
 

@@ -134,6 +134,9 @@ class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
     detector: ComponentStatus
     light: ComponentStatus
     faults: Annotated[list[str], Meta(description="what is wrong, one line each; empty: nothing")]
+    fault_codes: Annotated[
+        list[str], Meta(description="codes of `faults`, in their order (docs/faults-reference.md)")
+    ]
     counters: Counters
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 import msgspec
 import numpy as np
 
+from bikeped.faults import fault_texts
 from bikeped.pipeline.loop import Outcome
 from bikeped.telemetry.latency import STAGES
 from bikeped.types import Decision, Kind, PairMetrics, Signal, State
@@ -153,7 +154,7 @@ class LiveState:
             blink_hz=0.0 if signal is None else signal.blink_hz,
             sentence=self._sentence,
             decided=None if decision is None else decision.state.name,
-            faults=() if signal is None else signal.faults,
+            faults=() if signal is None else fault_texts(signal.faults),
             signal_age_s=None if self._signal_s is None else now_s - self._signal_s,
             frame=None if outcome is None else outcome.picture.frame.number,
             frame_age_s=None if self._frame_s is None else now_s - self._frame_s,

@@ -10,6 +10,7 @@ import pytest
 
 from bikeped.config import FeedbackConfig, GpioConfig, UsbConfig
 from bikeped.errors import FeedbackError
+from bikeped.faults import Fault
 from bikeped.feedback import check_light, light_driver, open_light
 from bikeped.feedback.light import LightDriver, SimulatedLight, assign_lamps
 from bikeped.types import Colour, Signal
@@ -40,18 +41,18 @@ class FakeLight:
 
     def open(self) -> FakeLight:
         if self.broken:
-            raise FeedbackError("light: not plugged in")
+            raise FeedbackError("not plugged in")
         self.opened += 1
         return self
 
     def set(self, colour: Colour) -> None:
         if self.broken:
-            raise FeedbackError("light: unplugged")
+            raise FeedbackError("unplugged")
         self._note(colour)
 
     def close(self) -> None:
         if self.broken:
-            raise FeedbackError("light: unplugged")
+            raise FeedbackError("unplugged")
         self._note("close")
 
     def _note(self, call: Colour | str) -> None:
@@ -152,7 +153,7 @@ def test_an_error_is_reported_retried_with_growing_pauses_and_mended() -> None:
             tries_s.append(clock.now_s - start_s)
         clock.now_s = wake_s
     assert tries_s == [0.0, 0.5, 1.5, 3.5, 5.5]
-    assert driver.fault == "light: not plugged in"
+    assert driver.fault == Fault("light", "light.error", "not plugged in")
     assert driver.colour is None
     light.broken = False
     run(driver, clock, clock.now_s + 2, BLUE)
@@ -179,7 +180,7 @@ def test_a_bug_in_a_device_is_a_fault_like_any_other() -> None:
     driver, _, clock = make(light)
     driver.show(BLUE)
     driver.step(clock.now_s)
-    assert driver.fault == "light: IndexError: list index out of range"
+    assert str(driver.fault) == "light: IndexError: list index out of range"
 
 
 def test_the_thread_shows_signals_and_close_darkens() -> None:
@@ -222,7 +223,8 @@ def test_a_hanging_device_blocks_nobody_and_is_a_fault() -> None:
     driver.show(GREEN)
     assert driver.fault is None
     clock.now_s += 2.1
-    assert driver.fault == "light: the device has not answered for more than 2 s"
+    assert str(driver.fault) == "light: the device has not answered for more than 2 s"
+    assert driver.fault.code == "light.hang"
     assert not driver.close(0.01)
     release.set()
     assert driver.close(WAIT_S)

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.config import FeedbackConfig
+from bikeped.faults import Fault, fault_texts
 from bikeped.feedback.signal import OFF, STARTING, SignalLogic, assess, fault_signal
 from bikeped.types import Colour, Signal, Sound, State
 
 FRAME_S = 1 / 30
-CAMERA = ("camera: no frame for more than 0.5 s",)
+CAMERA = (Fault("camera", "camera.no_frame", "no frame for more than 0.5 s"),)
 
 
 def recovered(**timings: float) -> tuple[SignalLogic, float]:
@@ -99,7 +100,7 @@ def test_a_fault_shows_at_once_and_counting_starts_again() -> None:
     assert fault == Signal("FAULT", Colour.ORANGE, 0.5, faults=CAMERA)
     good = [logic.step(now_s + i * FRAME_S, State.IDLE) for i in range(1, 5)]
     assert {signal.name for signal in good} == {"FAULT"}
-    assert good[0].faults == (f"recovering: {CAMERA[0]}",)
+    assert good[0].faults == (Fault("recovering", "service.recovering", str(CAMERA[0])),)
     logic.step(now_s + 0.2, None, CAMERA)
     later = [logic.step(now_s + 1 + i * FRAME_S, State.IDLE).name for i in range(5)]
     assert later == ["FAULT"] * 4 + ["IDLE"]
@@ -175,8 +176,7 @@ def test_fault_and_alert_refuse_to_be_steady(blink_hz: float) -> None:
 
 
 def test_assess_is_silent_when_all_is_fresh() -> None:
-    size = (3840, 2160)
-    assert assess(10, 9.6, 9.5, 0.5, 0.5, frame_size=size, table_size=size) == ()
+    assert assess(10, 9.6, 9.5, 0.5, 0.5) == ()
 
 
 @pytest.mark.parametrize(
@@ -196,17 +196,7 @@ def test_assess_is_silent_when_all_is_fresh() -> None:
 def test_assess_names_what_is_missing(
     frame_s: float | None, answer_s: float | None, expected: tuple[str, ...]
 ) -> None:
-    assert assess(10.0, frame_s, answer_s, 0.5, 0.5) == expected
-
-
-def test_assess_compares_table_and_frame_and_passes_explicit_faults_on() -> None:
-    faults = assess(
-        1, 1, 1, 0.5, 0.5, frame_size=(1920, 1080), table_size=(3840, 2160), explicit=("disk: x",)
-    )
-    assert faults == (
-        "geometry: the ground table is for 3840x2160 pixels, the frame has 1920x1080",
-        "disk: x",
-    )
+    assert fault_texts(assess(10.0, frame_s, answer_s, 0.5, 0.5)) == expected
 
 
 def test_fault_texts_stay_the_same_while_the_fault_lasts() -> None:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from bikeped.errors import CaptureError
+from bikeped.faults import Fault
 from bikeped.geometry import Framing, GroundCamera, Lens
 from bikeped.overlay import (
     OverlayData,
@@ -70,7 +71,7 @@ def test_banner_has_the_colour_of_the_light(state):
 
 
 def test_fault_is_hatched_and_never_blue_green_or_red():
-    signal = Signal("FAULT", Colour.ORANGE, faults=("camera: silent",))
+    signal = Signal("FAULT", Colour.ORANGE, faults=(Fault("camera", "camera.error", "silent"),))
     image = draw_overlay(GREY, moment(State.ALERT, signal=signal))
     strip = image[1]
     assert has(strip[None], SIGNAL_COLOUR["FAULT"])

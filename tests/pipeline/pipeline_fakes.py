@@ -10,6 +10,7 @@ import numpy as np
 
 from bikeped.config import LoadedConfig, parse_config
 from bikeped.detection.base import DetectorAnswer
+from bikeped.faults import fault_texts
 from bikeped.feedback import SignalLogic
 from bikeped.pipeline.detection_stage import Picture, Vision
 from bikeped.pipeline.loop import Limits, Loop, Outcome
@@ -171,7 +172,7 @@ class Recorder:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        return self.signals[-1][0].faults
+        return fault_texts(self.signals[-1][0].faults)
 
 
 class Rig:

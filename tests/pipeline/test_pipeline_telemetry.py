@@ -11,11 +11,12 @@ from pipeline_fakes import Clock, Rig, seen, small
 from prometheus_client import generate_latest
 
 from bikeped.errors import DetectorError
+from bikeped.faults import Fault
 from bikeped.feedback import SignalLogic
 from bikeped.pipeline.health_report import health_line, report_health
 from bikeped.pipeline.signal_dispatcher import Announcer
 from bikeped.pipeline.telemetry import Telemetry
-from bikeped.telemetry.builders import ComponentStatus, encode
+from bikeped.telemetry.builders import encode
 from bikeped.telemetry.metrics import Metrics
 from bikeped.types import Kind
 
@@ -133,24 +134,26 @@ async def test_every_frame_is_a_line_of_the_audit_log():
 
 async def test_health_says_what_is_wrong_and_how_old_the_newest_frame_is(small_jpegs):
     async with TelemetryRig() as rig:
-        part = ComponentStatus(ok=True, detail="simulated")
-        valid("health", encode(rig.telemetry.health(rig.loop, part)))  # before any frame
+        valid("health", encode(rig.telemetry.health(rig.loop, "simulated")))  # before any frame
         await rig.well()
         await rig.frames(1, jpeg=b"junk")
-        message = valid("health", encode(rig.telemetry.health(rig.loop, part, ("audit: full",))))
+        full = Fault("audit", "audit.error", "full")
+        message = valid("health", encode(rig.telemetry.health(rig.loop, "gpio", (full,))))
         assert message["camera"]["ok"]
         assert message["faults"] == ["audit: full"]
+        assert message["fault_codes"] == ["audit.error"]
+        assert message["light"] == {"ok": True, "detail": "gpio"}
         assert message["counters"]["undecodable"] == 1
         assert message["counters"]["mqtt_dropped"] == 3
         assert message["fps"] == 3.0  # six frames in the last two seconds
         rig.clock.now_s += 3.0
         await rig.recorder.some_ticks()
-        message = valid("health", encode(rig.telemetry.health(rig.loop, part)))
+        message = valid("health", encode(rig.telemetry.health(rig.loop, "simulated")))
         assert message["state"] == "FAULT"
         assert not message["camera"]["ok"]
         assert not message["detector"]["ok"]
         assert message["camera"]["capture_age_ms"] == pytest.approx(3000, abs=50)
-        line = health_line(rig.telemetry.health(rig.loop, part))
+        line = health_line(rig.telemetry.health(rig.loop, "simulated"))
         for stage in ("acquire", "pre", "inference", "post", "track", "decide", "feedback"):
             assert f"{stage} " in line
         assert "total " in line
@@ -159,19 +162,19 @@ async def test_health_says_what_is_wrong_and_how_old_the_newest_frame_is(small_j
 
 async def test_a_geometry_fault_makes_the_cameras_health_bad_and_no_other():
     async with TelemetryRig() as rig:
-        part = ComponentStatus(ok=True, detail="simulated")
         await rig.well()
         rig.clock.now_s += 0.03
         rig.feed.put(rig.clock.now_s, width=96, height=96)
         await rig.recorder.until(lambda: rig.recorder.name == "FAULT")
-        message = valid("health", encode(rig.telemetry.health(rig.loop, part)))
+        message = valid("health", encode(rig.telemetry.health(rig.loop, "simulated")))
         assert not message["camera"]["ok"]
         assert "proportions" in message["camera"]["detail"]
         assert message["detector"]["ok"]
         assert message["light"]["ok"]
         assert [fault.split(":")[0] for fault in message["faults"]] == ["geometry"]
+        assert message["fault_codes"] == ["camera.frame_size"]
         await rig.frames(5)
-        assert json.loads(encode(rig.telemetry.health(rig.loop, part)))["camera"]["ok"]
+        assert json.loads(encode(rig.telemetry.health(rig.loop, "simulated")))["camera"]["ok"]
 
 
 async def test_metrics_count_what_no_single_frame_tells():
@@ -197,7 +200,7 @@ async def test_every_lost_frame_is_in_health_metrics_and_log_line():
         rig.eye.error = None
         rig.feed.put(rig.clock.now_s - 50)
         await rig.recorder.until(lambda: rig.loop.counts.out_of_order == 1)
-        message = rig.telemetry.health(rig.loop, ComponentStatus(ok=True, detail="simulated"))
+        message = rig.telemetry.health(rig.loop, "simulated")
         counters = valid("health", encode(message))["counters"]
         assert {key: counters[key] for key in ("received", "frames", "undecodable")} == {
             "received": 12,
@@ -226,7 +229,7 @@ async def test_a_failing_health_report_costs_a_message_and_no_more(caplog):
             calls.put_nowait(1)
             if calls.qsize() == 1:
                 raise ValueError("a bug")
-            return rig.telemetry.health(rig.loop, ComponentStatus(ok=True, detail=""))
+            return rig.telemetry.health(rig.loop, "simulated")
 
         telling = asyncio.create_task(report_health(rig.telemetry, rig.loop, health, 0.01))
         try:

@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.errors import TelemetryError
+from bikeped.faults import Fault
 from bikeped.telemetry import builders as m
 from bikeped.telemetry import json_schema as schemas
 from bikeped.types import Decision, Detections, PairMetrics, State, Tracks
@@ -90,7 +91,7 @@ def health_message(**changes) -> m.HealthMessage:
         "capture_age_ms": None,
         "detector": m.ComponentStatus(ok=True, detail="onnxruntime, CPU"),
         "light": m.ComponentStatus(ok=True, detail="gpio"),
-        "faults": ["camera: no frame for 2 s"],
+        "faults": [Fault("camera", "camera.no_frame", "no frame for 2 s")],
         "counters": COUNTERS,
     }
     return m.health_message(**{**values, **changes})

@@ -1,0 +1,184 @@
+"""Every fault that the service can report, and what each one does.
+
+A `Fault` is made where its cause is known. What follows from it (what the light shows, which
+component's health it belongs to, how it clears, whether the process ends) stands once, in
+`FAULT_KINDS`. A new fault is one line of that table and one place that makes it. `python -m
+bikeped.faults docs/faults-reference.md` writes the page from the table.
+"""
+
+from __future__ import annotations
+
+import enum
+import logging
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from bikeped.files import write_whole
+
+#: Exit status for "start a fresh process" (EX_TEMPFAIL of sysexits.h); systemd restarts on it.
+EXIT_RESTART = 75
+
+Component = Literal["camera", "detector", "light", "speaker", "audit", "service"]
+
+
+class Effect(enum.Enum):
+    """What a fault does to the light."""
+
+    FAULT = "FAULT"  #: the decision cannot be trusted: the light shows FAULT
+    NOTICE = "none"  #: reported only: the decision still holds
+
+
+class Severity(enum.IntEnum):
+    """How a fault is logged; the values are those of `logging`."""
+
+    WARNING = logging.WARNING  #: the crossing is still watched and warned
+    ERROR = logging.ERROR  #: the crossing is not warned, or not fully
+    CRITICAL = logging.CRITICAL  #: this process cannot recover
+
+
+class Clears(enum.Enum):
+    """What ends a fault once its cause is gone."""
+
+    GOOD_FRAMES = "feedback.recover_frames good frames in a row"
+    AT_ONCE = "when the cause is gone"
+    RESTART = "a new process"
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One row of the table: what a fault of this code does and means."""
+
+    code: str  #: component and cause, as `camera.no_frame`; programs may rely on it
+    component: Component  #: whose health it belongs to
+    effect: Effect
+    severity: Severity
+    clears: Clears
+    meaning: str  #: one plain sentence for people
+    exit_status: int | None = None  #: of the process, where the fault ends it
+
+
+def _stops(code: str, component: Component, meaning: str) -> FaultKind:
+    """The light shows FAULT until good frames come again."""
+    return FaultKind(code, component, Effect.FAULT, Severity.ERROR, Clears.GOOD_FRAMES, meaning)
+
+
+def _ends(code: str, component: Component, meaning: str) -> FaultKind:
+    """Only a new process helps: the light shows FAULT and the service ends."""
+    return FaultKind(
+        code, component, Effect.FAULT, Severity.CRITICAL, Clears.RESTART, meaning, EXIT_RESTART
+    )
+
+
+def _notice(code: str, component: Component, severity: Severity, meaning: str) -> FaultKind:
+    """Reported, while the light goes on showing the decision."""
+    return FaultKind(code, component, Effect.NOTICE, severity, Clears.AT_ONCE, meaning)
+
+
+FAULT_KINDS: dict[str, FaultKind] = {
+    kind.code: kind
+    for kind in (
+        _stops("camera.no_frame", "camera", "No frame came for camera.stale_after_s."),
+        _stops("camera.future_time", "camera", "The newest frame's time lies in the future."),
+        _stops("camera.error", "camera", "The camera cannot be opened or read."),
+        _stops("camera.undecodable", "camera", "Frames arrive, but none can be decoded."),
+        _stops("camera.frame_size", "camera", "The frame does not fit the configured camera."),
+        _ends("camera.hang", "camera", "A read has not returned for camera.hang_after_s."),
+        _stops("detector.no_answer", "detector", "No answer for detection.silent_after_s."),
+        _stops("detector.future_time", "detector", "The newest answer's time is in the future."),
+        _stops("detector.error", "detector", "The detector fails on every frame."),
+        _ends("detector.hang", "detector", "Inference has not returned for camera.hang_after_s."),
+        _ends("detector.failing", "detector", "Only failures for camera.hang_after_s."),
+        _stops("service.starting", "service", "The model loads, or the first frames are due."),
+        _stops("service.recovering", "service", "A fault is over; good frames are counted."),
+        FaultKind(
+            "light.not_refreshed",
+            "light",
+            Effect.FAULT,
+            Severity.ERROR,
+            Clears.AT_ONCE,
+            "The service has not set the light for a second; its thread shows FAULT by itself.",
+        ),
+        _notice("light.error", "light", Severity.ERROR, "The light cannot be opened or set."),
+        _notice("light.hang", "light", Severity.ERROR, "The light's device does not answer."),
+        FaultKind(
+            "light.thread_ended",
+            "light",
+            Effect.NOTICE,
+            Severity.CRITICAL,
+            Clears.RESTART,
+            "The light's thread has ended.",
+        ),
+        _notice("speaker.error", "speaker", Severity.WARNING, "A sound could not be played."),
+        _notice("audit.error", "audit", Severity.WARNING, "The audit log cannot be written."),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that is wrong now.
+
+    `source` is what reports it, `code` a key of `FAULT_KINDS`, `detail` one line for people. The
+    detail carries no age or counter, so that a fault that lasts stays equal to itself and is
+    logged once. ValueError for an unknown code.
+    """
+
+    source: str
+    code: str
+    detail: str
+
+    def __post_init__(self) -> None:
+        if self.code not in FAULT_KINDS:
+            raise ValueError(f"{self.code!r} is not in bikeped.faults.FAULT_KINDS; add it there")
+
+    @property
+    def kind(self) -> FaultKind:
+        """What this fault does."""
+        return FAULT_KINDS[self.code]
+
+    def __str__(self) -> str:
+        return f"{self.source}: {self.detail}"
+
+
+def fault_texts(faults: Iterable[Fault]) -> tuple[str, ...]:
+    """The lines for people, in order."""
+    return tuple(map(str, faults))
+
+
+def markdown() -> str:
+    """The reference page: one row a fault."""
+    rows = [
+        (
+            f"`{kind.code}`",
+            kind.meaning,
+            kind.effect.value,
+            kind.component,
+            kind.severity.name.lower(),
+            kind.clears.value,
+            "" if kind.exit_status is None else str(kind.exit_status),
+        )
+        for kind in FAULT_KINDS.values()
+    ]
+    head = ("code", "meaning", "light", "component", "severity", "clears", "exit status")
+    lines = [f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows)]
+    return _INTRO + "\n".join(lines) + "\n"
+
+
+_INTRO = """\
+# Faults
+
+<!-- Made by `python -m bikeped.faults docs/faults-reference.md` from the table in
+     bikeped/faults.py; change it there. -->
+
+What can be wrong, and what each fault does. The codes stand in `fault_codes` of the
+[health message](messages/README.md), beside the lines for people in `faults`. A fault whose light
+is FAULT makes the light blink orange, never blue or green; one with an exit status also ends the
+process, so that systemd starts a fresh one.
+
+"""
+
+if __name__ == "__main__":
+    write_whole(Path(sys.argv[1]), markdown())
