@@ -1,73 +1,113 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
 
 from bikeped.errors import BikepedError
+
+
+class WholeFile:
+    """A temporary file beside `path`: `commit` renames it to `path`, `discard` removes it.
+
+    `partial` is its path and ends like `path`, for writers that choose a format by the suffix. As
+    a context manager it commits after success and discards after an exception. Raises OSError.
+    """
+
+    def __init__(self, path: Path, mode: int = 0o644) -> None:
+        handle, name = tempfile.mkstemp(f".partial{path.suffix}", f".{path.stem}.", path.parent)
+        os.close(handle)
+        self.path, self.partial, self._mode = path, Path(name), mode
+
+    def commit(self) -> None:
+        """Gives the file its name and mode; removes it where that fails."""
+        try:
+            self.partial.chmod(self._mode)
+            self.partial.replace(self.path)
+        except BaseException:
+            self.discard()
+            raise
+
+    def discard(self) -> None:
+        """Removes the temporary file; again is harmless."""
+        self.partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> Path:
+        return self.partial
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.commit()
+        else:
+            self.discard()
+
+
+@contextlib.contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside `folder`, renamed to it after success, else removed.
+
+    An empty folder of that name is replaced. Raises OSError.
+    """
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        yield partial
+        partial.chmod(0o755)
+        partial.replace(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
     """Writes text (as UTF-8) or bytes under a temporary name and renames it.
 
-    A pipe or a device is written to as it is; a file of its name would take its place.
-    BikepedError, naming the file and the mend, when it cannot.
+    A pipe or a device is written to as it is: a rename would put a file in its place. Raises
+    BikepedError, naming the file and the remedy, when it cannot.
     """
     data = content.encode("utf-8") if isinstance(content, str) else content
-    try:
+    with _named(path, "written", "choose a folder that exists and that you may write"):
         if path.exists() and not path.is_file() and not path.is_dir():
             path.write_bytes(data)
             return
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise BikepedError(
-            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and that "
-            "you may write"
-        ) from error
+        with WholeFile(path) as partial:
+            partial.write_bytes(data)
 
 
 def write_like(path: Path, content: bytes, like: Path) -> None:
-    """As `write_whole`, onto the disk, with the mode and owner of the file `like`.
+    """As `write_whole`, flushed to the disk, with the mode and owner of the file `like`.
 
-    For files that belong to somebody, such as config.yaml, and must survive a loss of power.
+    For files such as config.yaml that have an owner and must survive a loss of power.
     """
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
+    with _named(path, "written", "do it as a user who may write there"):
+        status = like.stat()
+        with WholeFile(path, status.st_mode & 0o7777) as partial:
+            with partial.open("wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            was = like.stat()
-            Path(name).chmod(was.st_mode & 0o7777)
-            with contextlib.suppress(PermissionError):  # only root gives files away
-                os.chown(name, was.st_uid, was.st_gid)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise BikepedError(
-            f"{path}: cannot be written ({error.strerror}); do it as a user who may write there"
-        ) from error
+            with contextlib.suppress(PermissionError):  # only root may change the owner
+                os.chown(partial, status.st_uid, status.st_gid)
 
 
 def make_folder(folder: Path, option: str = "--out") -> None:
-    """Makes an output folder and its parents; BikepedError when that cannot be."""
-    try:
+    """Makes an output folder and its parents; BikepedError when it cannot."""
+    with _named(folder, "made", f"choose another {option}"):
         folder.mkdir(parents=True, exist_ok=True)
+
+
+@contextlib.contextmanager
+def _named(path: Path, done: str, remedy: str) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
-        raise BikepedError(
-            f"{folder}: cannot be made ({error.strerror}); choose another {option}"
-        ) from error
+        raise BikepedError(f"{path}: cannot be {done} ({error.strerror}); {remedy}") from error

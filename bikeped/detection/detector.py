@@ -18,7 +18,7 @@ import numpy.typing as npt
 from bikeped.detection.base import DetectorAnswer
 from bikeped.detection.classes import UNMAPPED, class_names, kind_table, riders_are_whole
 from bikeped.detection.model_metadata import ModelMetadata
-from bikeped.detection.nms import merge, suppress
+from bikeped.detection.nms import non_max_suppression, vote_boxes
 from bikeped.detection.output_layouts import Candidates, Layout, choose_layout, decode, pick_output
 from bikeped.detection.partial_persons import suppress_partial_person_boxes
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
@@ -221,7 +221,7 @@ class NetworkDetector:
         on_frame = np.nonzero((box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1]))[0]
         kind, score, box = kind[on_frame], score[on_frame], box[on_frame]
         keep = self._suppress(box, score, kind)
-        steady = merge(box, score, kind, keep, self._config.merge_overlap)
+        steady = vote_boxes(box, score, kind, keep, self._config.merge_overlap)
         joined = join_riders(
             suppress_partial_person_boxes(Detections(kind[keep], score[keep], steady)),
             self._rider_overlap,
@@ -236,7 +236,7 @@ class NetworkDetector:
         Where a cyclist's box holds the rider, one person boxed as both is the likelier of the two.
         """
         group = np.where(kind == Kind.CYCLIST, Kind.PEDESTRIAN, kind) if self._whole else kind
-        return suppress(box, score, group, self._config.iou, self._config.max_detections)
+        return non_max_suppression(box, score, group, self._config.iou, self._config.max_detections)
 
 
 def _shares(region: Region) -> str:

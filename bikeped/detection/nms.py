@@ -14,22 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bikeped.geometry.boxes import iou_matrix
 from bikeped.types import Float32Array, IntArray
 
 _BLOCK = 192
 
 
-def overlap_matrix(a: Float32Array, b: Float32Array) -> Float32Array:
-    """Intersection over union [n, m] of boxes `a` [n, 4] and `b` [m, 4] (x1, y1, x2, y2)."""
-    wide = np.minimum(a[:, None, 2], b[None, :, 2]) - np.maximum(a[:, None, 0], b[None, :, 0])
-    high = np.minimum(a[:, None, 3], b[None, :, 3]) - np.maximum(a[:, None, 1], b[None, :, 1])
-    shared = np.maximum(wide, 0) * np.maximum(high, 0)
-    union = _area(a)[:, None] + _area(b)[None, :] - shared
-    overlap: Float32Array = shared / np.maximum(union, np.finfo(np.float32).tiny)
-    return overlap
-
-
-def suppress(
+def non_max_suppression(
     box: Float32Array,
     score: Float32Array,
     group: npt.NDArray[Any],
@@ -50,7 +41,7 @@ def suppress(
         kept.append(survivors)
         count += len(survivors)
         if len(order):
-            hit = overlap_matrix(box[survivors], box[order]) > iou
+            hit = iou_matrix(box[survivors], box[order]) > iou
             hit &= group[survivors][:, None] == group[order][None, :]
             order = order[~hit.any(axis=0)]
     if not kept:
@@ -58,7 +49,7 @@ def suppress(
     return np.concatenate(kept)[:most].astype(np.int64)
 
 
-def merge(
+def vote_boxes(
     box: Float32Array,
     score: Float32Array,
     group: npt.NDArray[Any],
@@ -75,7 +66,7 @@ def merge(
     """
     if overlap >= 1:
         return box[keep]
-    near = overlap_matrix(box[keep], box) >= overlap
+    near = iou_matrix(box[keep], box) >= overlap
     near &= group[keep][:, None] == group[None, :]
     near[np.arange(len(keep)), keep] = True  # also a box without area
     weight = near * np.maximum(score, np.finfo(np.float32).tiny)[None, :]
@@ -85,7 +76,7 @@ def merge(
 
 def _settle(box: Float32Array, group: npt.NDArray[Any], iou: float) -> npt.NDArray[np.bool_]:
     """Which boxes of one block, strongest first, the greedy algorithm keeps."""
-    over = (overlap_matrix(box, box) > iou) & (group[:, None] == group[None, :])
+    over = (iou_matrix(box, box) > iou) & (group[:, None] == group[None, :])
     beats = np.triu(over, 1).astype(np.float32)  # [stronger, weaker]
     keep = np.ones(len(box), np.bool_)
     while True:
@@ -93,8 +84,3 @@ def _settle(box: Float32Array, group: npt.NDArray[Any], iou: float) -> npt.NDArr
         if np.array_equal(again, keep):
             return keep
         keep = again
-
-
-def _area(box: Float32Array) -> Float32Array:
-    area: Float32Array = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
-    return area

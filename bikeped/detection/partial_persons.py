@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bikeped.geometry.boxes import intersection_area
 from bikeped.types import BoolArray, Detections, Kind
 
 # The half lies by this share of its area within the whole,
@@ -44,13 +45,10 @@ def suppress_partial_person_boxes(found: Detections) -> Detections:
 def _is_half(box: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> BoolArray:
     """[n, n]: whether the row's box is the upper half of the column's."""
     small, large = box[:, None, :], box[None, :, :]
-    wide = np.minimum(small[..., 2], large[..., 2]) - np.maximum(small[..., 0], large[..., 0])
-    high = np.minimum(small[..., 3], large[..., 3]) - np.maximum(small[..., 1], large[..., 1])
     small_wide, small_high = small[..., 2] - small[..., 0], small[..., 3] - small[..., 1]
     large_wide, large_high = large[..., 2] - large[..., 0], large[..., 3] - large[..., 1]
-    shared = np.maximum(wide, 0) * np.maximum(high, 0)
     return np.asarray(
-        (shared >= _WITHIN * small_wide * small_high)
+        (intersection_area(small, large) >= _WITHIN * small_wide * small_high)
         & (np.abs(small[..., 1] - large[..., 1]) <= _TOP * large_high)
         & (small_high < _HEIGHT * large_high)
         & (small_wide >= _WIDTH * large_wide)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bikeped.geometry.boxes import box_area, intersection_area
 from bikeped.types import BoolArray, Detections, Float32Array, FloatArray, Kind
 
 # The feet against the wheel line, as shares of the cycle's height: farther below it is someone in
@@ -74,12 +75,13 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
             score[own] = max(score[rider], score[own])
             # The same rider seen twice (head and shoulders, say) must not stay a pedestrian, nor a
             # wheel of the same cycle another cyclist.
-            shared, area = _shared(found.box_px[person], found.box_px[rider])
+            shared = intersection_area(found.box_px[person], found.box_px[rider])
+            area = box_area(found.box_px[person])
             least = np.minimum(area, area[i])
             gone[person[match.fits[:, j] & (shared >= _SAME_RIDER * least)]] = True
-            shared, area = _shared(found.box_px[cycle], box[own])
-            whole = (box[own, 2] - box[own, 0]) * (box[own, 3] - box[own, 1])
-            part = (shared >= _PART_WITHIN * area) & (area <= _PART_SIZE * whole)
+            shared = intersection_area(found.box_px[cycle], box[own])
+            area = box_area(found.box_px[cycle])
+            part = (shared >= _PART_WITHIN * area) & (area <= _PART_SIZE * box_area(box[own]))
             gone[cycle[part & ~ridden[cycle] & (found.confidence[cycle] <= score[own])]] = True
     left = np.nonzero(~gone)[0]
     order = left[np.argsort(-score[left], kind="stable")]
@@ -100,11 +102,9 @@ def _pairs(match: _Match) -> list[tuple[int, int]]:
 
 def _match(person: Float32Array, cycle: Float32Array, overlap: float) -> _Match:
     p, c = person.astype(np.float64)[:, None, :], cycle.astype(np.float64)[None, :, :]
-    waist = (p[..., 1] + p[..., 3]) / 2
-    wide = np.minimum(p[..., 2], c[..., 2]) - np.maximum(p[..., 0], c[..., 0])
-    high = np.minimum(p[..., 3], c[..., 3]) - np.maximum(waist, c[..., 1])
-    below = (p[..., 2] - p[..., 0]) * (p[..., 3] - waist)
-    cover = np.maximum(wide, 0) * np.maximum(high, 0) / np.maximum(below, 1e-9)
+    legs = p.copy()  # from the waist down
+    legs[..., 1] = (p[..., 1] + p[..., 3]) / 2
+    cover = intersection_area(legs, c) / np.maximum(box_area(legs), 1e-9)
     tall = np.maximum(c[..., 3] - c[..., 1], 1e-9)
     middle = (p[..., 0] + p[..., 2]) / 2
     offset = np.abs(middle - (c[..., 0] + c[..., 2]) / 2) / np.maximum(c[..., 2] - c[..., 0], 1e-9)
@@ -115,11 +115,3 @@ def _match(person: Float32Array, cycle: Float32Array, overlap: float) -> _Match:
     fits = stands & (feet <= _FEET_BELOW) & (offset <= 0.5) & (cover >= overlap) & (cover > 0)
     fits &= (ratio >= _LEAST_RATIO) & (ratio <= _MOST_RATIO)
     return _Match(cover, offset, fits)
-
-
-def _shared(box: Float32Array, other: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """[n] the area of each `box` [n, 4] within `other` [4], and its whole area."""
-    wide = np.minimum(box[:, 2], other[2]) - np.maximum(box[:, 0], other[0])
-    high = np.minimum(box[:, 3], other[3]) - np.maximum(box[:, 1], other[1])
-    area: Float32Array = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
-    return np.maximum(wide, 0) * np.maximum(high, 0), area

@@ -9,6 +9,7 @@ from types import TracebackType
 import cv2
 
 from bikeped.errors import CaptureError
+from bikeped.files import WholeFile
 from bikeped.types import ImageArray
 
 
@@ -28,10 +29,10 @@ class VideoWriter:
             raise CaptureError(f"{path}: its folder does not exist; make {path.parent} first")
         if not os.access(path.parent, os.W_OK):
             raise CaptureError(f"{path}: its folder is not writable; choose another folder")
-        self._partial = path.with_name(f".{path.stem}.partial-{os.getpid()}.mp4")
+        self._file = WholeFile(path)
         fourcc = cv2.VideoWriter.fourcc(*"mp4v")
         self._writer: cv2.VideoWriter | None = cv2.VideoWriter(
-            str(self._partial), fourcc, fps, size
+            str(self._file.partial), fourcc, fps, size
         )
         if not self._writer.isOpened():
             self.discard()
@@ -56,11 +57,11 @@ class VideoWriter:
             return
         self._writer.release()
         self._writer = None
-        if self.frames == 0 or not self._partial.exists():
-            self._partial.unlink(missing_ok=True)
+        if self.frames == 0 or not self._file.partial.exists():
+            self._file.discard()
             raise CaptureError(f"{self.path}: no picture was written; check the recording")
         try:
-            self._partial.replace(self.path)
+            self._file.commit()
         except OSError as error:
             raise CaptureError(
                 f"{self.path}: cannot be written ({error.strerror}); choose another name"
@@ -71,7 +72,7 @@ class VideoWriter:
         if self._writer is not None:
             self._writer.release()
             self._writer = None
-        self._partial.unlink(missing_ok=True)
+        self._file.discard()
 
     def __enter__(self) -> VideoWriter:
         return self

@@ -53,7 +53,7 @@ def frame(figures: Figures) -> None:
 def nms(figures: Figures) -> None:
     """300 and 3000 boxes in clumps, as a detector gives them before suppression."""
     from benchmarks.figures import in_turns
-    from bikeped.detection.nms import suppress
+    from bikeped.detection.nms import non_max_suppression
 
     rng = np.random.default_rng(1)
     for count in (300, 3000):
@@ -64,7 +64,9 @@ def nms(figures: Figures) -> None:
         score = rng.random(count).astype(np.float32)
         group = rng.integers(0, 3, count)
         a, b = in_turns(
-            lambda box=box, score=score, group=group: suppress(box, score, group, 0.45, 300),
+            lambda box=box, score=score, group=group: non_max_suppression(
+                box, score, group, 0.45, 300
+            ),
             lambda box=box, score=score, group=group: _loop(box, score, group, 0.45),
             5,
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import enum
+import hashlib
 import json
 import sys
 import types
@@ -222,6 +223,18 @@ def test_an_ultralytics_engine_from_file_to_frame_pixels(world, tmp_path, kind):
     assert found.box_px.tolist() == [[300, 250, 500, 350]]
     # The next frame is a new answer, not the one before.
     assert len(detector.infer(bright(0), 960, 640).detections) == 0
+
+
+def test_an_engine_is_known_by_the_sha256_of_its_whole_file(world, tmp_path):
+    path = save(tmp_path / "m.engine")
+    expected = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert load(path).model_hash == expected
+    assert load(path, sha256=expected.upper()).model_hash == expected
+    world.plans.clear()
+    path.write_bytes(path.read_bytes() + b"!")
+    with pytest.raises(DetectorError, match=rf"SHA-256 is (?!{expected}).* expects {expected}"):
+        load(path, sha256=expected)
+    assert world.plans == []  # refused before TensorRT reads it
 
 
 def test_a_bare_engine_with_a_dynamic_shape_is_tuned_for_its_optimum(world, tmp_path):

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bikeped.geometry.boxes import Boxes, iou_matrix
 from bikeped.lab.rendering import DrawnObject
-from bikeped.types import Detections, FloatArray, IntArray
+from bikeped.types import Detections, IntArray
 
 #: Least overlap (intersection over union) of a detection with the object that it is.
 #: Below COCO's 0.5: a walker 20 m away is four pixels wide, and half a pixel is a fifth of that.
@@ -30,7 +31,7 @@ def match_detections(detections: Detections, objects: Sequence[DrawnObject]) -> 
     of_detection = np.full(len(detections), -1)
     of_object = np.full(len(objects), -1)
     if len(detections) and objects:
-        overlap = iou(
+        overlap = iou_matrix(
             detections.box_px.astype(np.float64), np.asarray([o.box_px for o in objects], float)
         )
         same = detections.kind[:, None] == np.asarray([int(o.label) for o in objects])[None, :]
@@ -41,17 +42,7 @@ def match_detections(detections: Detections, objects: Sequence[DrawnObject]) -> 
     return DetectionMatch(of_detection, of_object)
 
 
-def _best_first(overlap: FloatArray) -> list[tuple[int, int]]:
+def _best_first(overlap: Boxes) -> list[tuple[int, int]]:
     d, o = np.nonzero(overlap >= MIN_IOU)
     order = np.argsort(-overlap[d, o], kind="stable")
     return list(zip(d[order].tolist(), o[order].tolist(), strict=True))
-
-
-def iou(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Intersection over union of boxes [n, 4] and [m, 4] (u1, v1, u2, v2), as [n, m]."""
-    low = np.maximum(first[:, None, :2], second[None, :, :2])
-    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
-    inside = np.clip(high - low, 0, None).prod(-1)
-    area = [np.clip(b[:, 2:] - b[:, :2], 0, None).prod(-1) for b in (first, second)]
-    union = area[0][:, None] + area[1][None, :] - inside
-    return np.asarray(np.where(union > 0, inside / np.maximum(union, 1e-12), 0.0))

@@ -20,6 +20,7 @@ from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig, config_hash, rule_settings
 from bikeped.config.provenance import decision_hash
 from bikeped.errors import BikepedError
+from bikeped.files import WholeFile
 from bikeped.lab.simulation.simulate import RuleInput, verdicts
 from bikeped.lab.simulation.suite import Suite, camera_json
 from bikeped.types import FloatArray, State
@@ -35,12 +36,10 @@ def write_audit(
 
     `seed` is recorded: what draws no random numbers gives the same file under every seed.
     """
-    partial = path.with_name(f"{path.name}.partial")
     try:
-        with partial.open("w", encoding="utf-8") as file:
+        with WholeFile(path) as partial, partial.open("w", encoding="utf-8") as file:
             for record in audit_records(suite, decision, loaded, seed):
                 file.write(json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n")
-        partial.replace(path)
     except OSError as error:
         raise BikepedError(
             f"{path}: the audit cannot be written ({error.strerror}); give --audit a file in a "

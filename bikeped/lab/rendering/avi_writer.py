@@ -6,12 +6,12 @@ file as they are, and readers that pass JPEG undecoded get them back as they wer
 
 from __future__ import annotations
 
-import os
 import struct
 from pathlib import Path
 from types import TracebackType
 
 from bikeped.errors import CaptureError
+from bikeped.files import WholeFile
 
 #: AVI's 32-bit sizes end at 4 GB, and careless readers at 2.
 _MAX_BYTES = 2_000_000_000
@@ -27,9 +27,9 @@ class AviWriter:
         self.path, self.fps, self.size = path, fps, size
         self._index: list[tuple[int, int]] = []
         self._largest = 0
-        self._partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
         try:
-            self._file = self._partial.open("wb")
+            self._whole = WholeFile(path)
+            self._file = self._whole.partial.open("wb")
         except OSError as error:
             raise CaptureError(
                 f"{path}: cannot be written ({error.strerror}); choose another folder"
@@ -57,12 +57,12 @@ class AviWriter:
         self._file.seek(0)
         self._file.write(self._header(end, total))
         self._file.close()
-        self._partial.replace(self.path)
+        self._whole.commit()
 
     def discard(self) -> None:
         """Stops and removes what was written so far."""
         self._file.close()
-        self._partial.unlink(missing_ok=True)
+        self._whole.discard()
 
     def _header(self, movi_end: int, total: int = 8) -> bytes:
         width, height = self.size

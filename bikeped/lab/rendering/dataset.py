@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.errors import BikepedError
-from bikeped.files import make_folder
+from bikeped.files import make_folder, whole_folder
 from bikeped.lab.rendering.clip import encode_jpeg
 from bikeped.lab.rendering.conditions import Conditions, random_conditions
 from bikeped.lab.rendering.labels import DrawnObject
@@ -95,56 +93,53 @@ def write_dataset(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise BikepedError(f"{folder}: is there already; choose another folder or remove it")
     make_folder(folder.parent)
+    drawn = pictures(count, seed, camera, size=size, lens=lens, mix=mix)
     try:
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        with whole_folder(folder) as partial:
+            _write_pictures(partial, drawn, seed, lens, count, progress)
     except OSError as error:
         raise BikepedError(
-            f"{folder}: cannot be made ({error.strerror}); choose another folder"
+            f"{folder}: cannot be written ({error.strerror}); choose another folder, or check the "
+            "free disk space"
         ) from error
-    try:
-        (partial / "images").mkdir()
-        images: list[dict[str, Any]] = []
-        notes: list[dict[str, Any]] = []
-        drawn = pictures(count, seed, camera, size=size, lens=lens, mix=mix)
-        for number, one in enumerate(drawn):
-            name = f"{number:06d}.jpg"
-            quality = 78 + (seed * 7 + number * 5) % 18
-            (partial / "images" / name).write_bytes(encode_jpeg(one.image, quality))
-            images.append(
-                {
-                    "id": number + 1,
-                    "file_name": name,
-                    "width": one.image.shape[1],
-                    "height": one.image.shape[0],
-                    "conditions": asdict(one.conditions),
-                    "furniture": [{"what": w, "bbox": _bbox(box)} for w, box in one.furniture],
-                }
-            )
-            notes += [
-                _annotation(len(notes) + i + 1, number + 1, o) for i, o in enumerate(one.objects)
-            ]
-            if progress is not None:
-                progress(number + 1, count)
-        data = {
-            "info": {"description": "drawn by bikeped", "seed": seed, "lens": lens},
-            "images": images,
-            "annotations": notes,
-            "categories": CATEGORIES,
-        }
-        (partial / "annotations.json").write_text(json.dumps(data) + "\n", encoding="utf-8")
-        partial.chmod(0o755)
-        if folder.exists():
-            folder.rmdir()
-        partial.replace(folder)
-    except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise BikepedError(
-            f"{folder}: cannot be written ({error.strerror}); check the free disk space"
-        ) from error
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
     return folder / "annotations.json"
+
+
+def _write_pictures(
+    folder: Path,
+    drawn: Iterator[DrawnPicture],
+    seed: int,
+    lens: str,
+    count: int,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    (folder / "images").mkdir()
+    images: list[dict[str, Any]] = []
+    notes: list[dict[str, Any]] = []
+    for number, one in enumerate(drawn):
+        name = f"{number:06d}.jpg"
+        quality = 78 + (seed * 7 + number * 5) % 18
+        (folder / "images" / name).write_bytes(encode_jpeg(one.image, quality))
+        images.append(
+            {
+                "id": number + 1,
+                "file_name": name,
+                "width": one.image.shape[1],
+                "height": one.image.shape[0],
+                "conditions": asdict(one.conditions),
+                "furniture": [{"what": w, "bbox": _bbox(box)} for w, box in one.furniture],
+            }
+        )
+        notes += [_annotation(len(notes) + i + 1, number + 1, o) for i, o in enumerate(one.objects)]
+        if progress is not None:
+            progress(number + 1, count)
+    data = {
+        "info": {"description": "drawn by bikeped", "seed": seed, "lens": lens},
+        "images": images,
+        "annotations": notes,
+        "categories": CATEGORIES,
+    }
+    (folder / "annotations.json").write_text(json.dumps(data) + "\n", encoding="utf-8")
 
 
 def _annotation(number: int, image: int, item: DrawnObject) -> dict[str, Any]:

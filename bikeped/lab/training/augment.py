@@ -7,9 +7,6 @@ order or on who works on it. The new data set appears whole or not at all.
 from __future__ import annotations
 
 import concurrent.futures
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,6 +20,7 @@ import numpy.typing as npt
 
 from bikeped import __version__
 from bikeped.errors import DataSetError
+from bikeped.files import whole_folder
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.training.coco import (
     CocoData,
@@ -323,14 +321,10 @@ def _whole_folder(data: CocoData, out: Path) -> Iterator[Path]:
             )
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     except OSError as error:
         raise DataSetError(f"--out {out}: cannot be made ({error.strerror})") from error
     try:
-        yield folder
-        folder.chmod(0o755)
-        os.replace(folder, target)  # noqa: PTH105 - onto an empty folder, too
+        with whole_folder(target) as folder:
+            yield folder
     except OSError as error:
         raise DataSetError(f"--out {out}: cannot be written ({error.strerror})") from error
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

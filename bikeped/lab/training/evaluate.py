@@ -33,7 +33,7 @@ from bikeped import __version__
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.detector import NetworkDetector
-from bikeped.detection.nms import suppress
+from bikeped.detection.nms import non_max_suppression
 from bikeped.detection.output_layouts import Candidates
 from bikeped.errors import DataSetError, require
 from bikeped.files import write_whole
@@ -274,7 +274,7 @@ class _Gathered:
             group = group_of[every.class_id]
             wanted = group >= 0
             box, score, group = every.box[wanted], every.score[wanted], group[wanted]
-            keep = suppress(box, score, group, self._iou, _MOST_OF_A_PICTURE)
+            keep = non_max_suppression(box, score, group, self._iou, _MOST_OF_A_PICTURE)
             self._parts[part].append(_Part(image, group[keep], box[keep] * scale, score[keep]))
         kind = users.kind.astype(np.int64)
         self._parts[2].append(_Part(image, kind, users.box_px * scale, users.confidence))

@@ -22,7 +22,7 @@ import numpy as np
 
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.detection.nms import overlap_matrix
+from bikeped.geometry.boxes import iou_matrix
 from bikeped.lab.training.coco import MISTAKEN, CocoData, CocoImage, furniture
 from bikeped.lab.training.crops import reduced_picture
 from bikeped.lab.training.export import export_network
@@ -88,7 +88,7 @@ def _mistakes(
     for image, people in looks:
         rgb = reduced_picture(image, *detector.decode_size(image.width, image.height))
         seen = detector.infer(rgb, image.width, image.height).detections
-        overlap = overlap_matrix(seen.box_px, people).max(axis=1, initial=0.0)
+        overlap = iou_matrix(seen.box_px, people).max(axis=1, initial=0.0)
         mistaken = (overlap < settings.overlap) & np.isin(seen.kind, _KINDS)
         found[image.id] = seen.box_px[mistaken].astype(np.float64)
     return found

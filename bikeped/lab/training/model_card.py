@@ -22,6 +22,7 @@ from bikeped.config import LoadedConfig
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import Detector, load_detector
 from bikeped.geometry import road_region
+from bikeped.geometry.boxes import iou_matrix
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, pictures, scene_camera
 from bikeped.lab.rendering.clip import encode_jpeg
 from bikeped.types import Detections, FloatArray, Kind, Region
@@ -259,7 +260,7 @@ def judge_picture(
         bool,
     )
     kind = np.array([int(o.label) for o in objects], np.int64)
-    overlap = _overlap(found.box_px.astype(np.float64), box)
+    overlap = iou_matrix(found.box_px.astype(np.float64), box)
     taken: dict[int, int] = {}
     rows = []
     for d in range(len(found)):
@@ -294,14 +295,3 @@ def _ground(found: Detections, view: SceneCamera) -> tuple[FloatArray, Any]:
     """Bottom centres on the ground [n, 2], and which of them lie there."""
     xy, valid = view.camera.ground(view.framing.frame_to_crop(found.bottom_centre_px()))
     return xy, valid
-
-
-def _overlap(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Intersection over union [n, m]."""
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    shared = np.maximum(high - low, 0).prod(axis=2)
-    area_a, area_b = ((x[:, 2:] - x[:, :2]).prod(axis=1) for x in (a, b))
-    union = area_a[:, None] + area_b[None] - shared
-    result: FloatArray = shared / np.maximum(union, 1e-9)
-    return result

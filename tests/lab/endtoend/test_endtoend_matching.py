@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 from endtoend_fakes import drawn, found
-from hypothesis import given
-from hypothesis import strategies as st
 
-from bikeped.lab.endtoend.matching import iou, match_detections
+from bikeped.lab.endtoend.matching import match_detections
 from bikeped.types import Detections, Kind
 
 WALKER, RIDER = Kind.PEDESTRIAN, Kind.CYCLIST
@@ -38,18 +35,3 @@ def test_touching_is_not_matching() -> None:
 def test_nothing_matches_nothing() -> None:
     assert match_detections(Detections.empty(), [drawn(1, WALKER, BOX)]).found.tolist() == [-1]
     assert match_detections(found((WALKER, BOX)), []).object.tolist() == [-1]
-
-
-coordinate = st.floats(0, 100, allow_nan=False)
-
-
-@given(st.lists(st.tuples(coordinate, coordinate, coordinate, coordinate), min_size=1, max_size=5))
-def test_overlap_is_a_share_and_one_with_itself(corners: list[tuple[float, ...]]) -> None:
-    boxes = np.asarray(
-        [[min(a, c), min(b, d), max(a, c) + 1, max(b, d) + 1] for a, b, c, d in corners]
-    )
-    table = iou(boxes, boxes)
-    assert (table >= 0).all()
-    assert (table <= 1 + 1e-9).all()
-    np.testing.assert_allclose(np.diag(table), 1.0)
-    np.testing.assert_allclose(table, table.T)

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 
 from test_training_fit import CROPS, SETTINGS, blobs  # noqa: E402
 
-from bikeped.detection.nms import overlap_matrix  # noqa: E402
+from bikeped.geometry.boxes import iou_matrix  # noqa: E402
 from bikeped.lab.training.coco import MISTAKEN, furniture  # noqa: E402
 from bikeped.lab.training.crops import Cutter, read_view, usual_places  # noqa: E402
 from bikeped.lab.training.fit import fit, shown_size  # noqa: E402
@@ -55,7 +55,7 @@ def test_a_mistake_is_on_nobody(data, mined):
     for image in told.images:
         people = np.array([o.box_px for o in told.objects[image.id]], np.float32)
         # Furniture is cut at the picture's edge, which raises an overlap a little.
-        assert (overlap_matrix(mistakes(image).astype(np.float32), people) < 0.15).all()
+        assert (iou_matrix(mistakes(image).astype(np.float32), people) < 0.15).all()
 
 
 def test_a_further_look_forgets_the_one_before_and_keeps_what_stands_there(data, eager, mined):
