@@ -31,7 +31,7 @@ from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.model_hash import sha256_of
 from bikeped.files import make_folder, write_whole
-from bikeped.lab.rendering.random_scene import USUAL_MIX
+from bikeped.lab.rendering.random_scene import DEFAULT_MIX
 from bikeped.lab.training.augment import AugmentSettings, augment_data
 from bikeped.lab.training.coco import read_coco
 from bikeped.lab.training.crops import CropSettings
@@ -173,7 +173,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             "seed_data": TRAINING.seed,
             "configured_share": TRAINING.configured,
-            "usual_mix": asdict(USUAL_MIX),
+            "usual_mix": asdict(DEFAULT_MIX),
             "validation_pictures": sum(test.pictures for test in VALIDATION),
             "most_false": {kind.label: most for kind, most in MOST_FALSE.items()},
             "drawing": read(out / "drawing.json"),

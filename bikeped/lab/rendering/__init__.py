@@ -7,7 +7,7 @@ from bikeped.lab.rendering.conditions import LIGHTS, WEATHERS, Conditions, rando
 from bikeped.lab.rendering.dataset import pictures, write_dataset
 from bikeped.lab.rendering.labels import KINDS, DrawnObject
 from bikeped.lab.rendering.painter import ScenePainter
-from bikeped.lab.rendering.random_scene import Mix, random_camera, random_scenario
+from bikeped.lab.rendering.random_scene import SceneMix, random_camera, random_scenario
 from bikeped.lab.rendering.render_camera import (
     DEFAULT_POSE,
     SceneCamera,
@@ -24,8 +24,8 @@ __all__ = [
     "ClipTruth",
     "Conditions",
     "DrawnObject",
-    "Mix",
     "SceneCamera",
+    "SceneMix",
     "ScenePainter",
     "lens_camera",
     "pictures",

@@ -13,8 +13,8 @@ from bikeped.lab.rendering.furniture import LAMP_HEAD_M, fixture, house
 from bikeped.lab.rendering.ground_texture import GroundMap, ground_map, noise_tile
 from bikeped.lab.rendering.mesh import Mesh, normals
 from bikeped.lab.rendering.render_camera import Rays, SceneCamera, rays
-from bikeped.lab.rendering.sprite import Sprite, rasterise, shaded
-from bikeped.lab.rendering.street_layout import Fixture, Place, place
+from bikeped.lab.rendering.sprite import Sprite, rasterise, shade_faces
+from bikeped.lab.rendering.street_layout import Fixture, StreetLayout, street_layout
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
 
 _SHIFT = 4
@@ -24,7 +24,7 @@ _SAMPLES = (-0.375, -0.125, 0.125, 0.375)
 
 
 @dataclass(frozen=True)
-class Standing:
+class FixtureSprite:
     """A fixture in the picture, its mesh and how it looks."""
 
     item: Fixture
@@ -40,43 +40,43 @@ class Backdrop:
     view: SceneCamera
     conditions: Conditions
     light: Lighting
-    place: Place
+    layout: StreetLayout
     image: ImageArray
     lit: BoolArray
     vignette: Float32Array
-    standing: tuple[Standing, ...]
+    standing: tuple[FixtureSprite, ...]
 
     def lamplight(self, xy_m: FloatArray) -> FloatArray | None:
         """Light of the street lamps at a place on the ground [3]; None by day."""
-        return _lamplight(self.place, self.light, xy_m)
+        return _lamplight(self.layout, self.light, xy_m)
 
 
 @lru_cache(maxsize=2)
 def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
     """The backdrop; the last two are kept, for scenarios that share one."""
-    light, where, ray = (
+    light, layout, ray = (
         lighting(conditions),
-        place(conditions.place, conditions.clutter),
+        street_layout(conditions.place, conditions.clutter),
         rays(view),
     )
     canvas = _sky(ray, light, conditions)
-    _ground(canvas, ray, view, where, light)
+    _ground(canvas, ray, view, layout, light)
     image = np.clip(canvas, 0, 255).astype(np.uint8)
-    for item in sorted(where.houses, key=lambda h: -abs(h.front) - abs((h.x0 + h.x1) / 2 - 5)):
+    for item in sorted(layout.houses, key=lambda h: -abs(h.front) - abs((h.x0 + h.x1) / 2 - 5)):
         _draw_far(image, house(item, light.lamps), view, light)
     image = np.asarray(
         cv2.multiply(image, cv2.merge([ray.vignette] * 3), dtype=cv2.CV_8U), np.uint8
     )
     image[~ray.lit] = 0
     standing = []
-    for thing in where.fixtures:
+    for thing in layout.fixtures:
         away = float(np.hypot(*(np.array(thing.xy_m) - view.eye_m[:2])))
         mesh = fixture(thing, away)
-        local = _lamplight(where, light, np.array(thing.xy_m))
-        sprite = rasterise(mesh, view, light, local=local, away_m=away)
+        local = _lamplight(layout, light, np.array(thing.xy_m))
+        sprite = rasterise(mesh, view, light, local=local, distance_m=away)
         if sprite is not None:
-            standing.append(Standing(thing, mesh, sprite))
-    return Backdrop(view, conditions, light, where, image, ray.lit, ray.vignette, tuple(standing))
+            standing.append(FixtureSprite(thing, mesh, sprite))
+    return Backdrop(view, conditions, light, layout, image, ray.lit, ray.vignette, tuple(standing))
 
 
 def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
@@ -115,7 +115,7 @@ def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
 
 
 def _ground(
-    canvas: Float32Array, ray: Rays, view: SceneCamera, where: Place, light: Lighting
+    canvas: Float32Array, ray: Rays, view: SceneCamera, layout: StreetLayout, light: Lighting
 ) -> None:
     """Paints the ground into `canvas` below the horizon."""
     down = -ray.world[..., 2]
@@ -134,20 +134,20 @@ def _ground(
     deep = reach * reach / (eye[2] * view.focal_px)
     along = (x - eye[0]) * inverse * deep, (y - eye[1]) * inverse * deep
     fine = float(np.clip(2.2 / view.focal_px * 4.0, 0.012, 0.05))
-    near = ground_map(where, eye[0] - 16, eye[1] - 3, eye[0] + 16, eye[1] + 17, fine)
-    far = ground_map(where, eye[0] - 56, eye[1] - 28, eye[0] + 56, eye[1] + 50, 0.08)
+    near = ground_map(layout, eye[0] - 16, eye[1] - 3, eye[0] + 16, eye[1] + 17, fine)
+    far = ground_map(layout, eye[0] - 56, eye[1] - 28, eye[0] + 56, eye[1] + 50, 0.08)
     out = np.empty((*x.shape, 3), np.float32)
     blurred = GroundMap(np.asarray(cv2.blur(far.image, (9, 9)), np.uint8), far.x0, far.y0, far.res)
-    at_far = _looked_up(far, x, y, along, _SAMPLES)
-    at_horizon = _looked_up(blurred, x, y, along, (0.0,))
+    at_far = _sample_map(far, x, y, along, _SAMPLES)
+    at_horizon = _sample_map(blurred, x, y, along, (0.0,))
     t = np.clip((away - 26) / 14, 0, 1)[..., None]
     out = at_far * (1 - t) + at_horizon * t
-    at_near = _looked_up(near, x, y, along, (-0.25, 0.25))
+    at_near = _sample_map(near, x, y, along, (-0.25, 0.25))
     t = np.clip((_NEAR_M - away) / 3, 0, 1)[..., None]
     out += t * (at_near - out)
     lit: FloatArray | Float32Array = light.ground.astype(np.float32)
     if light.lamps:
-        lit = lit + _lamp_pools(where, np.dstack([x, y]))
+        lit = lit + _lamp_pools(layout, np.dstack([x, y]))
     if light.wet:
         out *= 0.62
     out *= lit
@@ -168,7 +168,7 @@ def _ground(
     np.copyto(canvas[top:bottom], out, where=below)
 
 
-def _looked_up(
+def _sample_map(
     source: GroundMap,
     x: Float32Array,
     y: Float32Array,
@@ -186,18 +186,18 @@ def _looked_up(
     return total / np.float32(len(offsets))
 
 
-def _lamplight(where: Place, light: Lighting, xy_m: FloatArray) -> FloatArray | None:
+def _lamplight(layout: StreetLayout, light: Lighting, xy_m: FloatArray) -> FloatArray | None:
     if not light.lamps:
         return None
-    return np.asarray(_lamp_pools(where, xy_m.astype(np.float32)[None])[0], np.float64)
+    return np.asarray(_lamp_pools(layout, xy_m.astype(np.float32)[None])[0], np.float64)
 
 
-def _lamp_pools(where: Place, xy: Float32Array) -> Float32Array:
+def _lamp_pools(layout: StreetLayout, xy: Float32Array) -> Float32Array:
     """Light of the street lamps at ground positions [..., 2] as factors [..., 3]."""
     out = np.zeros((*xy.shape[:-1], 3), np.float32)
     colour = np.array([0.98, 0.80, 0.54], np.float32)
     reach, high = LAMP_HEAD_M
-    for item in where.fixtures:
+    for item in layout.fixtures:
         if item.what != "lamp":
             continue
         lx = item.xy_m[0] + reach * np.cos(item.heading_rad)
@@ -228,7 +228,9 @@ def _draw_far(image: ImageArray, mesh: Mesh, view: SceneCamera, light: Lighting)
     kept = facing[seen]
     away = np.linalg.norm(middle[kept] - view.eye_m, axis=1)
     haze = (1 - np.exp(-np.maximum(away - 15, 0) / light.haze_m))[:, None]
-    colour = shaded(mesh, normal, kept, light, np.array([0.2, 0.17, 0.12]) if light.lamps else None)
+    colour = shade_faces(
+        mesh, normal, kept, light, np.array([0.2, 0.17, 0.12]) if light.lamps else None
+    )
     colour += haze * (light.sky_low - colour)
     fixed = np.round((pixels[seen] - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)).astype(np.int32)
     for i in np.argsort(mesh.layer[kept], kind="stable"):

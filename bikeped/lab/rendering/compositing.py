@@ -17,7 +17,7 @@ _EVEN = 0.04  #: vignettes that differ by less within a sprite are taken as one
 _RING = np.linspace(0, 2 * np.pi, 17)[:-1]
 
 
-def paste(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
+def paste_sprite(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
     """Draws a sprite over the picture, darkened toward the lens' rim and paler in the distance."""
     height, width = sprite.alpha.shape
     spot = inside(street.view.size, sprite.left, sprite.top, width, height)
@@ -28,7 +28,7 @@ def paste(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
     alpha = sprite.alpha[patch_rows, patch_columns]
     kept = cv2.multiply(part, cv2.merge([255 - alpha] * 3), scale=1 / 255)
     colour = sprite.colour[patch_rows, patch_columns]
-    haze = 1 - float(np.exp(-max(sprite.away_m - 15, 0) / street.light.haze_m))
+    haze = 1 - float(np.exp(-max(sprite.distance_m - 15, 0) / street.light.haze_m))
     if haze > 0.01:
         low = street.light.sky_low.astype(np.float32)
         pale = alpha[..., None].astype(np.float32) / 255 * low * haze

@@ -16,7 +16,7 @@ from bikeped.lab.rendering.clip import encode_jpeg
 from bikeped.lab.rendering.conditions import Conditions, random_conditions
 from bikeped.lab.rendering.labels import DrawnObject
 from bikeped.lab.rendering.painter import Box, ScenePainter
-from bikeped.lab.rendering.random_scene import USUAL_MIX, Mix, random_camera, random_scenario
+from bikeped.lab.rendering.random_scene import DEFAULT_MIX, SceneMix, random_camera, random_scenario
 from bikeped.lab.rendering.render_camera import SceneCamera
 from bikeped.types import ImageArray, Kind
 
@@ -47,7 +47,7 @@ def pictures(
     *,
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
-    mix: Mix = USUAL_MIX,
+    mix: SceneMix = DEFAULT_MIX,
 ) -> Iterator[DrawnPicture]:
     """`count` drawn pictures with their objects: random scenarios, lights, weathers and places.
 
@@ -75,7 +75,7 @@ def write_dataset(
     *,
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
-    mix: Mix = USUAL_MIX,
+    mix: SceneMix = DEFAULT_MIX,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Writes `folder`/images/*.jpg and `folder`/annotations.json; returns the latter.

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bikeped.lab.rendering.mesh import Builder, Mesh, Point, Rgb
+from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Point, Rgb
 from bikeped.lab.rendering.street_layout import Fixture, House
 from bikeped.lab.rendering.vehicles import vehicle
 from bikeped.lab.scenarios.scenario import SIZES_M
@@ -16,26 +16,30 @@ LAMP_HEAD_M = (1.6, 5.9)  #: how far over the road and how high a street lamp sh
 
 
 #: Length and width of what stands on the ground.
-FEET_M: dict[str, tuple[float, float]] = {"car": (4.5, 1.8), "bin": (0.5, 0.5), "tree": (0.5, 0.5)}
-POLE_FOOT_M = (0.2, 0.2)
+FOOTPRINT_M: dict[str, tuple[float, float]] = {
+    "car": (4.5, 1.8),
+    "bin": (0.5, 0.5),
+    "tree": (0.5, 0.5),
+}
+POLE_FOOTPRINT_M = (0.2, 0.2)
 
 
-def fixture(item: Fixture, away_m: float) -> Mesh:
+def fixture(item: Fixture, distance_m: float) -> Mesh:
     """The mesh of a fixture, in the world; a near tree has more and smaller leaves."""
     rng = np.random.default_rng(item.number)
     if item.what == "car":
         mesh = vehicle("car", SIZES_M["car"], item.number)
     elif item.what == "tree":
-        mesh = _tree(rng, 1600 if away_m < 12 else 420)
+        mesh = _tree(rng, 1600 if distance_m < 12 else 420)
     else:
-        b = Builder()
+        b = MeshBuilder()
         {"lamp": _lamp, "sign": _sign, "signal": _signal, "bin": _bin, "hydrant": _hydrant,
          "bollard": _bollard}[item.what](b, rng)  # fmt: skip
         mesh = b.build()
     return mesh.placed(item.xy_m, item.heading_rad)
 
 
-def _lamp(b: Builder, rng: np.random.Generator) -> None:
+def _lamp(b: MeshBuilder, rng: np.random.Generator) -> None:
     b.limb((0, 0, 0.05), (0, 0, 0.8), 0.11, 0.09, _STEEL)
     b.limb((0, 0, 0.8), (0, 0, 6.0), 0.075, 0.05, _STEEL)
     b.limb((0, 0, 6.0), (LAMP_HEAD_M[0], 0, 6.15), 0.045, 0.04, _STEEL)
@@ -43,7 +47,7 @@ def _lamp(b: Builder, rng: np.random.Generator) -> None:
     b.lamp((1.6, 0, 6.0), (255, 214, 150), 2.2)
 
 
-def _sign(b: Builder, rng: np.random.Generator) -> None:
+def _sign(b: MeshBuilder, rng: np.random.Generator) -> None:
     b.limb((0, 0, 0.02), (0, 0, 2.5), 0.035, 0.03, (150, 152, 156))
     colour = ((200, 40, 40), (30, 80, 170), (240, 200, 40))[int(rng.integers(3))]
     turn = np.linspace(0, 2 * np.pi, 4 + 4 * int(rng.integers(1, 4)) + 1)[:-1]
@@ -56,7 +60,7 @@ def _sign(b: Builder, rng: np.random.Generator) -> None:
             b.faces(plate[:, ::-1] * (-1, 1, 1), (120, 122, 126), layer=1)
 
 
-def _signal(b: Builder, rng: np.random.Generator) -> None:
+def _signal(b: MeshBuilder, rng: np.random.Generator) -> None:
     b.limb((0, 0, 0.02), (0, 0, 2.9), 0.06, 0.05, (70, 74, 70))
     b.box((0.04, -0.13, 2.2), (0.2, 0.13, 3.0), (34, 36, 36))
     green = rng.random() < 0.5
@@ -72,21 +76,21 @@ def _signal(b: Builder, rng: np.random.Generator) -> None:
         b.faces(np.stack([middle, rim[:-1], rim[1:], middle], axis=1), shade, 0.9 if on else 0.0, 1)
 
 
-def _bin(b: Builder, rng: np.random.Generator) -> None:
+def _bin(b: MeshBuilder, rng: np.random.Generator) -> None:
     colour = ((52, 78, 60), (60, 62, 66), (150, 90, 40))[int(rng.integers(3))]
     b.loft(
         [(0, 0, 0.02), (0, 0, 0.85), (0, 0, 0.95)], [[0.22, 0.22], [0.27, 0.27], [0.2, 0.2]], colour
     )
 
 
-def _hydrant(b: Builder, rng: np.random.Generator) -> None:
+def _hydrant(b: MeshBuilder, rng: np.random.Generator) -> None:
     colour: Rgb = (190, 46, 36) if rng.random() < 0.6 else (214, 180, 50)
     b.limb((0, 0, 0.1), (0, 0, 0.6), 0.11, 0.1, colour)
     b.limb((0, -0.17, 0.45), (0, 0.17, 0.45), 0.06, 0.06, colour)
     b.limb((0, 0, 0.62), (0, 0, 0.72), 0.09, 0.03, colour)
 
 
-def _bollard(b: Builder, rng: np.random.Generator) -> None:
+def _bollard(b: MeshBuilder, rng: np.random.Generator) -> None:
     tall = float(rng.uniform(0.8, 1.1))
     b.limb(
         (0, 0, 0.05), (0, 0, tall), 0.07, 0.065, _STEEL if rng.random() < 0.6 else (216, 190, 60)
@@ -96,7 +100,7 @@ def _bollard(b: Builder, rng: np.random.Generator) -> None:
 
 def _tree(rng: np.random.Generator, count: int) -> Mesh:
     """A trunk and a crown of leaves: small faces turned every way about a few lobes."""
-    b = Builder(sides=7)
+    b = MeshBuilder(sides=7)
     tall = float(rng.uniform(4.6, 7.2))
     bark: Rgb = (92, 76, 62)
     b.limb((0, 0, 0.1), (0.1, 0.05, tall * 0.5), 0.17, 0.12, bark)

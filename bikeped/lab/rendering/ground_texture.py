@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from bikeped.lab.rendering.mesh import Rgb
-from bikeped.lab.rendering.street_layout import Place
+from bikeped.lab.rendering.street_layout import StreetLayout
 from bikeped.types import Float32Array, ImageArray
 
 _WHITE: Rgb = (228, 229, 224)
@@ -42,7 +42,7 @@ def noise_tile(seed: int, size: int = 512) -> Float32Array:
     return scaled
 
 
-class _Pen:
+class MapCanvas:
     """Draws in metres on a map."""
 
     def __init__(self, image: ImageArray, x0: float, y0: float, res: float) -> None:
@@ -79,107 +79,111 @@ class _Pen:
         cv2.polylines(self.image, [fixed], False, colour, thick, cv2.LINE_AA, _SHIFT)
 
 
-def ground_map(where: Place, x0: float, y0: float, x1: float, y1: float, res: float) -> GroundMap:
+def ground_map(
+    layout: StreetLayout, x0: float, y0: float, x1: float, y1: float, res: float
+) -> GroundMap:
     """The map of a rectangle of the world at `res` metres a pixel."""
     width, height = int((x1 - x0) / res), int((y1 - y0) / res)
     image: ImageArray = np.empty((height, width, 3), np.uint8)
-    image[:] = where.verge
-    pen = _Pen(image, x0, y0, res)
-    _surfaces(pen, where, x0, x1, y0, y1)
-    _markings(pen, where, x0, x1)
-    _wear(pen, where)
-    return GroundMap(_textured(image, where, res), x0, y0, res)
+    image[:] = layout.verge
+    canvas = MapCanvas(image, x0, y0, res)
+    _surfaces(canvas, layout, x0, x1, y0, y1)
+    _markings(canvas, layout, x0, x1)
+    _wear(canvas, layout)
+    return GroundMap(_textured(image, layout, res), x0, y0, res)
 
 
-def _surfaces(pen: _Pen, where: Place, x0: float, x1: float, y0: float, y1: float) -> None:
-    k, edge = where.kerb, where.kerb + where.walk
-    fine = pen.res < 0.05
+def _surfaces(
+    canvas: MapCanvas, layout: StreetLayout, x0: float, x1: float, y0: float, y1: float
+) -> None:
+    k, edge = layout.kerb, layout.kerb + layout.walk
+    fine = canvas.res < 0.05
     # South of the road the paving reaches to the camera's pole and beyond.
-    south = -edge - (5.5 if where.number % 3 == 0 else 2.0)
+    south = -edge - (5.5 if layout.number % 3 == 0 else 2.0)
     for low, high in ((south, -k), (k, edge)):
-        pen.rect(x0, low, x1, high, where.paving)
+        canvas.rect(x0, low, x1, high, layout.paving)
         if fine:
-            joint: Rgb = tuple(c * 0.8 for c in where.paving)  # type: ignore[assignment]
-            for x in np.arange(x0 - x0 % where.slab_m, x1, where.slab_m).tolist():
-                pen.line([(x, low), (x, high)], 0.02, joint)
-            for y in np.arange(low, high, where.slab_m).tolist():
-                pen.line([(x0, y), (x1, y)], 0.02, joint)
-    dark: Rgb = tuple(c * 0.92 for c in where.asphalt)  # type: ignore[assignment]
-    pen.rect(x0, -k, x1, k, where.asphalt)
-    if where.side_street is not None:
-        a, c = where.side_street
+            joint: Rgb = tuple(c * 0.8 for c in layout.paving)  # type: ignore[assignment]
+            for x in np.arange(x0 - x0 % layout.slab_m, x1, layout.slab_m).tolist():
+                canvas.line([(x, low), (x, high)], 0.02, joint)
+            for y in np.arange(low, high, layout.slab_m).tolist():
+                canvas.line([(x0, y), (x1, y)], 0.02, joint)
+    dark: Rgb = tuple(c * 0.92 for c in layout.asphalt)  # type: ignore[assignment]
+    canvas.rect(x0, -k, x1, k, layout.asphalt)
+    if layout.side_street is not None:
+        a, c = layout.side_street
         # South of the road it is a narrow lane, or the street goes on.
-        pen.rect(a, k - 0.1, c, y1, where.asphalt)
-        pen.rect(a, y0, c, -k + 0.1, where.asphalt)
+        canvas.rect(a, k - 0.1, c, y1, layout.asphalt)
+        canvas.rect(a, y0, c, -k + 0.1, layout.asphalt)
         for x in (a, c):
             for low, high in ((y0, -k), (k, y1)):
-                pen.rect(x - 0.1, low, x + 0.1, high, (190, 188, 182))
-    for x_a, x_b in _off_side(where, x0, x1):
+                canvas.rect(x - 0.1, low, x + 0.1, high, (190, 188, 182))
+    for x_a, x_b in _off_side(layout, x0, x1):
         for y, way in ((k, 1), (-k, -1)):
-            pen.rect(x_a, y - 0.02, x_b, y + 0.16 * way, (192, 190, 184))
-            pen.rect(x_a, y - 0.28 * way, x_b, y - 0.02, dark)
+            canvas.rect(x_a, y - 0.02, x_b, y + 0.16 * way, (192, 190, 184))
+            canvas.rect(x_a, y - 0.28 * way, x_b, y - 0.02, dark)
     for y in (-0.62 * k, -0.28 * k, 0.28 * k, 0.62 * k):  # wheel tracks
         for d in (-0.75, 0.75):
-            pen.rect(x0, y + d - 0.25, x1, y + d + 0.25, dark, 0.5)
+            canvas.rect(x0, y + d - 0.25, x1, y + d + 0.25, dark, 0.5)
 
 
-def _off_side(where: Place, x0: float, x1: float) -> list[tuple[float, float]]:
-    if where.side_street is None:
+def _off_side(layout: StreetLayout, x0: float, x1: float) -> list[tuple[float, float]]:
+    if layout.side_street is None:
         return [(x0, x1)]
-    return [(x0, where.side_street[0]), (where.side_street[1], x1)]
+    return [(x0, layout.side_street[0]), (layout.side_street[1], x1)]
 
 
-def _markings(pen: _Pen, where: Place, x0: float, x1: float) -> None:
-    k, lane = where.kerb, where.lane_m
-    c0, c1 = where.crosswalk
+def _markings(canvas: MapCanvas, layout: StreetLayout, x0: float, x1: float) -> None:
+    k, lane = layout.kerb, layout.lane_m
+    c0, c1 = layout.crosswalk
     spans = [
         span
-        for a, b in _off_side(where, x0, x1)
+        for a, b in _off_side(layout, x0, x1)
         for span in ((a, min(b, c0 - 1.9)), (max(a, c1 + 1.9), b))
         if span[1] > span[0]
     ]
     for a, b in spans:
-        if where.bike_lanes:
+        if layout.bike_lanes:
             for way in (1, -1):
                 inner, outer = way * lane, way * (lane + 1.9)
-                if where.green_lanes:
+                if layout.green_lanes:
                     low, high = sorted((inner, outer))
-                    pen.rect(a, low, b, high, (84, 132, 104), 0.75)
+                    canvas.rect(a, low, b, high, (84, 132, 104), 0.75)
                 for y in (inner, outer) if lane + 1.9 < k - 0.5 else (inner,):
-                    pen.rect(a, y - 0.06, b, y + 0.06, _WHITE)
-        centre = _YELLOW if where.yellow_centre else _WHITE
-        if where.yellow_centre:
+                    canvas.rect(a, y - 0.06, b, y + 0.06, _WHITE)
+        centre = _YELLOW if layout.yellow_centre else _WHITE
+        if layout.yellow_centre:
             for y in (-0.14, 0.14):
-                pen.rect(a, y - 0.05, b, y + 0.05, centre)
+                canvas.rect(a, y - 0.05, b, y + 0.05, centre)
         else:
             for x in np.arange(np.ceil(a / 4) * 4, b - 2, 4.0).tolist():
-                pen.rect(x, -0.06, x + 2, 0.06, centre)
-    share = 0.55 if where.crosswalk_style == "worn" else 0.95
-    if where.crosswalk_style in {"bars", "ladder", "worn"}:
+                canvas.rect(x, -0.06, x + 2, 0.06, centre)
+    share = 0.55 if layout.crosswalk_style == "worn" else 0.95
+    if layout.crosswalk_style in {"bars", "ladder", "worn"}:
         for y in np.arange(-k + 0.45, k - 0.6, 1.0).tolist():
-            pen.rect(c0, y, c1, y + 0.5, _WHITE, share)
-    if where.crosswalk_style in {"ladder", "lines"}:
+            canvas.rect(c0, y, c1, y + 0.5, _WHITE, share)
+    if layout.crosswalk_style in {"ladder", "lines"}:
         for x in (c0 - 0.3, c1):
-            pen.rect(x, -k + 0.1, x + 0.3, k - 0.1, _WHITE, share)
-    pen.rect(c0 - 1.6, -k + 0.1, c0 - 1.2, -0.25, _WHITE, 0.9)
-    pen.rect(c1 + 1.2, 0.25, c1 + 1.6, k - 0.1, _WHITE, 0.9)
+            canvas.rect(x, -k + 0.1, x + 0.3, k - 0.1, _WHITE, share)
+    canvas.rect(c0 - 1.6, -k + 0.1, c0 - 1.2, -0.25, _WHITE, 0.9)
+    canvas.rect(c1 + 1.2, 0.25, c1 + 1.6, k - 0.1, _WHITE, 0.9)
     for y0, y1 in ((-k - 0.85, -k - 0.2), (k + 0.2, k + 0.85)):
-        pen.rect(c0, y0, c1, y1, (206, 168, 80))
-        if pen.res < 0.03:
+        canvas.rect(c0, y0, c1, y1, (206, 168, 80))
+        if canvas.res < 0.03:
             for x in np.arange(c0 + 0.08, c1, 0.16).tolist():
-                pen.line([(x, y0), (x, y1)], 0.04, (176, 140, 62))
-    if where.bike_lanes:
+                canvas.line([(x, y0), (x, y1)], 0.04, (176, 140, 62))
+    if layout.bike_lanes:
         for x in (-12.0, 12.5, 26.0):
             for way in (1, -1):
-                _bicycle_sign(pen, x, way * (lane + 0.95), -way)
+                _bicycle_sign(canvas, x, way * (lane + 0.95), -way)
 
 
-def _bicycle_sign(pen: _Pen, x: float, y: float, way: int) -> None:
+def _bicycle_sign(canvas: MapCanvas, x: float, y: float, way: int) -> None:
     """The painted bicycle, 1.8 m long."""
     turn = np.linspace(0, 2 * np.pi, 20)
     for hub in (-0.5, 0.5):
         ring = [(x + way * (hub + 0.32 * np.cos(a)), y + 0.32 * np.sin(a)) for a in turn]
-        pen.line(ring, 0.07, _WHITE)
+        canvas.line(ring, 0.07, _WHITE)
     frame = (
         (-0.5, 0),
         (-0.1, 0.05),
@@ -189,24 +193,24 @@ def _bicycle_sign(pen: _Pen, x: float, y: float, way: int) -> None:
         (-0.2, 0.5),
         (-0.1, 0.05),
     )
-    pen.line([(x + way * a, y + way * b) for a, b in frame], 0.07, _WHITE)
-    pen.line([(x + way * 0.5, y), (x + way * 0.32, y + way * 0.68)], 0.07, _WHITE)
+    canvas.line([(x + way * a, y + way * b) for a, b in frame], 0.07, _WHITE)
+    canvas.line([(x + way * 0.5, y), (x + way * 0.32, y + way * 0.68)], 0.07, _WHITE)
 
 
-def _wear(pen: _Pen, where: Place) -> None:
+def _wear(canvas: MapCanvas, layout: StreetLayout) -> None:
     """Manholes, patches, cracks and stains."""
-    rng = np.random.default_rng((where.number, 31))
-    k = where.kerb
+    rng = np.random.default_rng((layout.number, 31))
+    k = layout.kerb
     for _ in range(7):
         x, y = float(rng.uniform(-22, 32)), float(rng.uniform(-k + 0.6, k - 0.6))
         w, h = float(rng.uniform(0.8, 4.5)), float(rng.uniform(0.6, 1.6))
         tone = float(rng.uniform(0.8, 1.12))
-        pen.rect(x, y, x + w, y + h, tuple(c * tone for c in where.asphalt), 0.5)  # type: ignore[arg-type]
+        canvas.rect(x, y, x + w, y + h, tuple(c * tone for c in layout.asphalt), 0.5)  # type: ignore[arg-type]
     turn = np.linspace(0, 2 * np.pi, 24)
     for _ in range(5):
         x, y = float(rng.uniform(-16, 26)), float(rng.uniform(-k - 2, k))
         disc = [(x + 0.34 * np.cos(a), y + 0.34 * np.sin(a)) for a in turn]
-        pen.poly(disc, (64, 64, 66), 0.85)
+        canvas.poly(disc, (64, 64, 66), 0.85)
     for _ in range(14):
         x, y = float(rng.uniform(-20, 30)), float(rng.uniform(-k, k))
         way = float(rng.uniform(0, 2 * np.pi))
@@ -218,21 +222,21 @@ def _wear(pen: _Pen, where: Place) -> None:
                 break
             path.append((x, y))
         if len(path) > 1:
-            pen.line(path, 0.02, (66, 67, 70))
+            canvas.line(path, 0.02, (66, 67, 70))
     for _ in range(60):
         x, y = float(rng.uniform(-20, 30)), float(rng.uniform(-12, 12))
         r = float(rng.uniform(0.04, 0.35))
         blob = [(x + r * np.cos(a) * rng.uniform(0.6, 1), y + r * np.sin(a)) for a in turn[::2]]
-        pen.poly(blob, (70, 68, 64), float(rng.uniform(0.08, 0.3)))
+        canvas.poly(blob, (70, 68, 64), float(rng.uniform(0.08, 0.3)))
 
 
-def _textured(image: ImageArray, where: Place, res: float) -> ImageArray:
+def _textured(image: ImageArray, layout: StreetLayout, res: float) -> ImageArray:
     """Grain and large stains, by multiplication."""
     height, width = image.shape[:2]
-    tile = noise_tile(where.number % 3)
+    tile = noise_tile(layout.number % 3)
     repeat = (-(-height // 512), -(-width // 512))
     grain = np.clip(1.0 + 0.05 * tile, 0.7, 1.3)
-    rows = np.random.default_rng(where.number).integers(0, 512, 2)
+    rows = np.random.default_rng(layout.number).integers(0, 512, 2)
     grain = np.tile(np.roll(grain, tuple(rows.tolist()), (0, 1)), repeat)[:height, :width]
     # Stains of some metres: the same noise, drawn large.
     part_y, part_x = (min(max(int(n * res * 2), 8), 512) for n in (height, width))

@@ -19,7 +19,7 @@ KINDS: dict[str, Kind] = {
     "bus": Kind.VEHICLE,
     "truck": Kind.VEHICLE,
 }
-_SEEN = 0.4  #: coverage of a pixel from which on it belongs to somebody
+_MIN_COVERAGE = 0.4  #: coverage of a pixel from which on it belongs to somebody
 _MIN_PX = 1.5  #: smaller than this on a side is not in the picture
 
 
@@ -51,7 +51,7 @@ class DrawnObject:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Occluder:
     """Somebody or something that hides what is behind it; with a `kind`, it gets a label."""
 
     sprite: Sprite
@@ -62,7 +62,7 @@ class Candidate:
 
 
 def label(
-    candidates: list[Candidate], lit: BoolArray, pose: CameraPose, size: tuple[int, int]
+    candidates: list[Occluder], lit: BoolArray, pose: CameraPose, size: tuple[int, int]
 ) -> list[DrawnObject]:
     """Objects of the `candidates` that have a kind, far ones first as given, as far as they show.
 
@@ -96,7 +96,7 @@ def _hide(cover: Float32Array, far: Sprite, near: Sprite) -> None:
 
 
 def _drawn(
-    item: Candidate,
+    item: Occluder,
     kind: str,
     cover: Float32Array,
     lit: BoolArray,
@@ -109,7 +109,7 @@ def _drawn(
         return None
     rows, columns, patch_rows, patch_columns = spot
     shows = cover[patch_rows, patch_columns] * lit[rows, columns]
-    seen = shows >= _SEEN
+    seen = shows >= _MIN_COVERAGE
     across, down = np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1))
     if len(across) == 0:
         return None

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bikeped.lab.rendering.backdrop import Standing, backdrop
-from bikeped.lab.rendering.compositing import darken, footprint, paste, shine
+from bikeped.lab.rendering.backdrop import FixtureSprite, backdrop
+from bikeped.lab.rendering.compositing import darken, footprint, paste_sprite, shine
 from bikeped.lab.rendering.conditions import Conditions
-from bikeped.lab.rendering.furniture import FEET_M, POLE_FOOT_M
-from bikeped.lab.rendering.labels import Candidate, DrawnObject, label
+from bikeped.lab.rendering.furniture import FOOTPRINT_M, POLE_FOOTPRINT_M
+from bikeped.lab.rendering.labels import DrawnObject, Occluder, label
 from bikeped.lab.rendering.mesh import Mesh
-from bikeped.lab.rendering.people import Looks, person
+from bikeped.lab.rendering.people import Appearance, person
 from bikeped.lab.rendering.render_camera import SceneCamera
 from bikeped.lab.rendering.riders import rider
 from bikeped.lab.rendering.sprite import Sprite, rasterise, shadow, touch
@@ -23,24 +23,24 @@ from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.types import FloatArray, ImageArray
 
 _PATH_CLEAR_M = 1.1  #: fixtures nearer than this to somebody's path are left out
-_ROUND_PX = 90.0  #: figures smaller than this need no round limbs
+_ROUND_LIMBS_PX = 90.0  #: figures smaller than this need no round limbs
 _USUAL = Conditions()
 #: Of the light in the middle of the picture: less, in the black of the lens' rim, shows nobody.
-_LEAST_LIGHT = 0.15
+_MIN_VIGNETTE = 0.15
 Box = tuple[float, float, float, float]  #: u1, v1, u2, v2 in pixels of the picture
 
 
 @dataclass(frozen=True)
-class _Shown:
+class _SceneItem:
     """Somebody or something in a picture; `mesh` of agents only, who are drawn anew each time."""
 
-    candidate: Candidate
+    candidate: Occluder
     mesh: Mesh | None = None
     size_m: tuple[float, float] = (0.5, 0.5)
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _FrameCache:
     """What was drawn at `t_s`."""
 
     t_s: float
@@ -63,26 +63,26 @@ class ScenePainter:
         self.scenario, self.camera, self.conditions = scenario, camera, conditions
         self.backdrop = backdrop(camera, conditions)
         self._weather = Weather(self.backdrop)
-        paths = np.concatenate([_dense(agent.path[:, 1:]) for agent in scenario.agents])
+        paths = np.concatenate([_resampled(agent.path[:, 1:]) for agent in scenario.agents])
         standing = [
-            s for s in self.backdrop.standing if not _in_the_way(s.item.what, s.item.xy_m, paths)
+            s for s in self.backdrop.standing if not _blocks_path(s.item.what, s.item.xy_m, paths)
         ]
-        standing.sort(key=lambda s: -s.sprite.away_m)
-        self._fixtures = [_Shown(_fixed(s, -1 - i)) for i, s in enumerate(standing)]
+        standing.sort(key=lambda s: -s.sprite.distance_m)
+        self._fixtures = [_SceneItem(_fixed(s, -1 - i)) for i, s in enumerate(standing)]
         width, height = camera.size
         self._furniture: list[tuple[str, Box]] = [
             (s.item.what, s.sprite.full_box_px)
             for s in standing
             if s.item.what != "car" and _touches(s.sprite.full_box_px, width, height)
         ]
-        self._looks = {
-            agent.id: Looks.of(np.random.default_rng((conditions.seed, agent.id, 3)))
+        self._appearances = {
+            agent.id: Appearance.random(np.random.default_rng((conditions.seed, agent.id, 3)))
             for agent in scenario.agents
         }
         self._mask = cv2.merge([self.backdrop.lit.astype(np.uint8) * 255] * 3)
-        self._seen = self.backdrop.lit & (self.backdrop.vignette >= _LEAST_LIGHT)
+        self._seen = self.backdrop.lit & (self.backdrop.vignette >= _MIN_VIGNETTE)
         self._base = self._with_fixtures(standing)
-        self._last: _Moment | None = None
+        self._last: _FrameCache | None = None
 
     def frame(self, t_s: float) -> ImageArray:
         """The picture [h, w, 3] RGB at `t_s` seconds of the scenario."""
@@ -109,14 +109,14 @@ class ScenePainter:
         moment = self._moment(t_s)
         return moment.image.copy(), list(moment.objects)
 
-    def _moment(self, t_s: float) -> _Moment:
+    def _moment(self, t_s: float) -> _FrameCache:
         if self._last is None or self._last.t_s != t_s:
             shown = self._present(t_s)
             image, shadows = self._picture(shown, t_s)
-            self._last = _Moment(t_s, image, self._labels(shown), shadows)
+            self._last = _FrameCache(t_s, image, self._labels(shown), shadows)
         return self._last
 
-    def _present(self, t: float) -> list[_Shown]:
+    def _present(self, t: float) -> list[_SceneItem]:
         """Everything that may hide or be hidden, far ones first."""
         found = list(self._fixtures)
         for agent in self.scenario.agents:
@@ -131,27 +131,27 @@ class ScenePainter:
                 self.camera,
                 self.backdrop.light,
                 local=self.backdrop.lamplight(xy),
-                away_m=away,
+                distance_m=away,
             )
             if sprite is not None:
-                candidate = Candidate(sprite, agent.id, agent.kind, xy, heading)
-                found.append(_Shown(candidate, mesh, agent.size_m[:2]))
-        found.sort(key=lambda item: -item.candidate.sprite.away_m)
+                candidate = Occluder(sprite, agent.id, agent.kind, xy, heading)
+                found.append(_SceneItem(candidate, mesh, agent.size_m[:2]))
+        found.sort(key=lambda item: -item.candidate.sprite.distance_m)
         return found
 
-    def _mesh(self, agent: Agent, t: float, away_m: float) -> Mesh:
-        looks = self._looks[agent.id]
-        tall_px = agent.size_m[2] * self.camera.focal_px / max(away_m, 1.0)
-        sides = 5 if tall_px < _ROUND_PX else 8
-        way, moving = _travelled(agent, t)
+    def _mesh(self, agent: Agent, t: float, distance_m: float) -> Mesh:
+        appearance = self._appearances[agent.id]
+        tall_px = agent.size_m[2] * self.camera.focal_px / max(distance_m, 1.0)
+        sides = 5 if tall_px < _ROUND_LIMBS_PX else 8
+        way, moving = _travel(agent, t)
         number = (self.conditions.seed * 31 + agent.id * 7) % 1000
         if agent.kind == "pedestrian":
-            return person(agent.size_m, looks, way, moving, sides)
+            return person(agent.size_m, appearance, way, moving, sides)
         if agent.kind in {"cyclist", "motorcycle"}:
-            return rider(agent.kind, agent.size_m, looks, number, way, sides)
+            return rider(agent.kind, agent.size_m, appearance, number, way, sides)
         return vehicle(agent.kind, agent.size_m, number)
 
-    def _picture(self, shown: list[_Shown], t: float) -> tuple[ImageArray, list[Box]]:
+    def _picture(self, shown: list[_SceneItem], t: float) -> tuple[ImageArray, list[Box]]:
         image = self._base.copy()
         shadows = []
         moving = [item for item in shown if item.mesh is not None]
@@ -166,7 +166,7 @@ class ScenePainter:
             sprite = item.candidate.sprite
             # What stands is in the picture already; it is drawn again over who is behind it.
             if item.mesh is not None or any(touch(sprite, other) for other in drawn):
-                paste(image, self.backdrop, sprite)
+                paste_sprite(image, self.backdrop, sprite)
                 drawn.append(sprite)
         if self.backdrop.light.lamps:
             for item in moving:
@@ -176,14 +176,14 @@ class ScenePainter:
         cv2.bitwise_and(image, self._mask, dst=image)
         return image, shadows
 
-    def _with_fixtures(self, standing: list[Standing]) -> ImageArray:
+    def _with_fixtures(self, standing: list[FixtureSprite]) -> ImageArray:
         """The street with everything that stands on it; `standing` far ones first."""
         image = self.backdrop.image.copy()
         for item in standing:
-            size = FEET_M.get(item.item.what, POLE_FOOT_M)
+            size = FOOTPRINT_M.get(item.item.what, POLE_FOOTPRINT_M)
             self._shade(image, item.mesh, np.array(item.item.xy_m), size, item.item.heading_rad)
         for item in standing:
-            paste(image, self.backdrop, item.sprite)
+            paste_sprite(image, self.backdrop, item.sprite)
         if self.backdrop.light.lamps:
             for item in standing:
                 if item.item.what == "lamp":
@@ -216,7 +216,7 @@ class ScenePainter:
             darken(image, self.camera.size, *patch, np.array([0.6, 0.6, 0.62]))
         return box
 
-    def _labels(self, shown: list[_Shown]) -> list[DrawnObject]:
+    def _labels(self, shown: list[_SceneItem]) -> list[DrawnObject]:
         found = label(
             [item.candidate for item in shown],
             self._seen,
@@ -231,13 +231,13 @@ def _touches(box: Box, width: int, height: int) -> bool:
     return box[0] < width and box[1] < height and box[2] > 0 and box[3] > 0
 
 
-def _fixed(standing: Standing, number: int) -> Candidate:
+def _fixed(standing: FixtureSprite, number: int) -> Occluder:
     item = standing.item
     kind = "car" if item.what == "car" else None
-    return Candidate(standing.sprite, number, kind, np.array(item.xy_m), item.heading_rad)
+    return Occluder(standing.sprite, number, kind, np.array(item.xy_m), item.heading_rad)
 
 
-def _travelled(agent: Agent, t: float) -> tuple[float, bool]:
+def _travel(agent: Agent, t: float) -> tuple[float, bool]:
     """Metres covered since the start, and whether the agent moves just now."""
     times = agent.path[:, 0]
     steps = np.hypot(*np.diff(agent.path[:, 1:], axis=0).T)
@@ -247,7 +247,7 @@ def _travelled(agent: Agent, t: float) -> tuple[float, bool]:
     return float(np.interp(t, times, way)), bool(speed > 0.1)
 
 
-def _dense(path: FloatArray) -> FloatArray:
+def _resampled(path: FloatArray) -> FloatArray:
     """The path [n, 2] with a point at least every 0.5 m; a long one less densely."""
     ends = np.cumsum(np.concatenate([[0.0], np.hypot(*np.diff(path, axis=0).T)]))
     count = int(min(max(ends[-1] / 0.5, 1), 2000)) + 1
@@ -255,7 +255,7 @@ def _dense(path: FloatArray) -> FloatArray:
     return np.stack([np.interp(along, ends, path[:, i]) for i in (0, 1)], axis=1)
 
 
-def _in_the_way(what: str, xy: tuple[float, float], paths: FloatArray) -> bool:
+def _blocks_path(what: str, xy: tuple[float, float], paths: FloatArray) -> bool:
     """Whether somebody would walk or ride through this fixture."""
     apart = np.abs(paths - np.array(xy))
     if what == "car":

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.lab.rendering.mesh import Builder, Mesh, Point, Rgb
+from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Point, Rgb
 
 SKINS: tuple[Rgb, ...] = (
     (236, 196, 170), (224, 178, 148), (198, 148, 114), (160, 112, 82), (118, 80, 60), (84, 58, 46),
@@ -33,7 +33,7 @@ CHILD_MAX_HEIGHT_M = 1.4
 
 
 @dataclass(frozen=True)
-class Looks:
+class Appearance:
     """What somebody wears; the same number always gives the same."""
 
     skin: Rgb
@@ -52,7 +52,7 @@ class Looks:
     pace: float  #: where in the step they start, 0..1
 
     @staticmethod
-    def of(rng: np.random.Generator) -> Looks:
+    def random(rng: np.random.Generator) -> Appearance:
         """Drawn at random."""
 
         def pick(choices: tuple[Rgb, ...]) -> Rgb:
@@ -61,7 +61,7 @@ class Looks:
             r, g, b = (float(np.clip(c + d, 16, 245)) for c, d in zip(colour, change, strict=True))
             return r, g, b
 
-        return Looks(
+        return Appearance(
             skin=SKINS[int(rng.integers(len(SKINS)))],
             hair=pick(HAIRS),
             top=pick(TOPS),
@@ -80,25 +80,31 @@ class Looks:
 
 
 def person(
-    size_m: tuple[float, float, float], looks: Looks, way_m: float, moving: bool, sides: int = 8
+    size_m: tuple[float, float, float],
+    style: Appearance,
+    travel_m: float,
+    moving: bool,
+    sides: int = 8,
 ) -> Mesh:
     """A pedestrian agent's mesh in its own axes: a wheelchair user, a child or a grown walker.
 
-    `way_m`: what they have covered, which poses their legs; `sides`: how round limbs are.
+    `travel_m`: what they have covered, which poses their legs; `sides`: how round limbs are.
     """
     if size_m[0] >= WHEELCHAIR_MIN_LENGTH_M:
-        return _wheelchair(size_m, looks, way_m, sides)
-    return walker(size_m[2], looks, way_m, moving, sides)
+        return _wheelchair(size_m, style, travel_m, sides)
+    return walker(size_m[2], style, travel_m, moving, sides)
 
 
-def walker(height_m: float, looks: Looks, way_m: float, moving: bool, sides: int = 8) -> Mesh:
+def walker(
+    height_m: float, style: Appearance, travel_m: float, moving: bool, sides: int = 8
+) -> Mesh:
     """Somebody on foot; the lower shoe stands on the ground."""
     s = height_m / 1.7
     child = height_m < CHILD_MAX_HEIGHT_M
-    phase = 2 * math.pi * (way_m / (_STRIDE_M * s) + looks.pace)
+    phase = 2 * math.pi * (travel_m / (_STRIDE_M * s) + style.pace)
     swing = 0.33 if moving else 0.05
-    b = Builder(sides)
-    g = looks.girth
+    b = MeshBuilder(sides)
+    g = style.girth
     legs = []
     low = math.inf
     for side in (1.0, -1.0):
@@ -120,12 +126,12 @@ def walker(height_m: float, looks: Looks, way_m: float, moving: bool, sides: int
     def at_height(p: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Point:
         return float(p[0]) * s, float(p[1]) * s, float(p[2] - low) * s
 
-    trousers = looks.legs if looks.wear in {"trousers", "coat"} else looks.skin
-    thigh_cloth = looks.legs if looks.wear != "skirt" else looks.skin
+    trousers = style.legs if style.wear in {"trousers", "coat"} else style.skin
+    thigh_cloth = style.legs if style.wear != "skirt" else style.skin
     for _, _, hip, knee, ankle, heel, toe in legs:
         b.limb(at_height(hip), at_height(knee), 0.085 * g * s, 0.062 * g * s, thigh_cloth)
         b.limb(at_height(knee), at_height(ankle), 0.06 * g * s, 0.045 * s, trousers)
-        b.limb(at_height(heel), at_height(toe), 0.042 * s, 0.036 * s, looks.shoes)
+        b.limb(at_height(heel), at_height(toe), 0.042 * s, 0.036 * s, style.shoes)
     up = -low
     lean = 0.03 if moving else 0.0
 
@@ -135,7 +141,7 @@ def walker(height_m: float, looks: Looks, way_m: float, moving: bool, sides: int
 
     b.loft(
         *spine((0, 0.82, 0.10, 0.08), (0, 0.88, 0.165, 0.115), (0, 1.0, 0.155, 0.105)),
-        looks.legs if looks.wear != "coat" else looks.top,
+        style.legs if style.wear != "coat" else style.top,
     )
     b.loft(
         *spine(
@@ -146,11 +152,11 @@ def walker(height_m: float, looks: Looks, way_m: float, moving: bool, sides: int
             (-0.005, 1.425, 0.13, 0.085),
             (0, 1.46, 0.05, 0.05),
         ),
-        looks.top,
+        style.top,
     )
-    if looks.wear in {"skirt", "coat"}:
-        hem = 0.55 if looks.wear == "skirt" else 0.62
-        cloth = looks.legs if looks.wear == "skirt" else looks.top
+    if style.wear in {"skirt", "coat"}:
+        hem = 0.55 if style.wear == "skirt" else 0.62
+        cloth = style.legs if style.wear == "skirt" else style.top
         flare = 0.05 * abs(math.sin(phase)) if moving else 0.0
         b.loft(
             *spine((0, hem, 0.2, 0.16 + flare), (0, 0.8, 0.18, 0.14), (0, 1.0, 0.15, 0.105)), cloth
@@ -161,55 +167,57 @@ def walker(height_m: float, looks: Looks, way_m: float, moving: bool, sides: int
         elbow = shoulder + 0.28 * np.array([math.sin(arm), 0.09 * side, -math.cos(arm)])
         fore = arm + (0.35 if moving else 0.15)
         hand = elbow + 0.25 * np.array([math.sin(fore), -0.03 * side, -math.cos(fore)])
-        sleeve = looks.top if looks.sleeves else looks.skin
-        b.limb(at_height(shoulder), at_height(elbow), 0.054 * g * s, 0.043 * g * s, looks.top)
+        sleeve = style.top if style.sleeves else style.skin
+        b.limb(at_height(shoulder), at_height(elbow), 0.054 * g * s, 0.043 * g * s, style.top)
         b.limb(at_height(elbow), at_height(hand), 0.041 * g * s, 0.032 * s, sleeve)
         grip = hand + np.array([0.01, 0, -0.05])
-        b.limb(at_height(hand), at_height(grip), 0.033 * s, 0.03 * s, looks.skin)
-        if looks.bag is not None and side > 0:
+        b.limb(at_height(hand), at_height(grip), 0.033 * s, 0.03 * s, style.skin)
+        if style.bag is not None and side > 0:
             x, y, z = at_height(grip)
             b.box(
                 (x - 0.14 * s, y - 0.05 * s, z - 0.28 * s),
                 (x + 0.14 * s, y + 0.05 * s, z),
-                looks.bag,
+                style.bag,
             )
     x, _, z = at_height(np.array([lean * 0.6, 0, 1.45]))
-    _head(b, (x, 0.0, z), s * (1.18 if child else 1.0), looks)
-    if looks.pack is not None:
+    _head(b, (x, 0.0, z), s * (1.18 if child else 1.0), style)
+    if style.pack is not None:
         z0 = (1.05 + up) * s
-        b.box((-0.26 * s, -0.13 * s, z0), (-0.1 * s, 0.13 * s, z0 + 0.36 * s), looks.pack)
+        b.box((-0.26 * s, -0.13 * s, z0), (-0.1 * s, 0.13 * s, z0 + 0.36 * s), style.pack)
     return b.build()
 
 
-def _head(b: Builder, neck: Point, s: float, looks: Looks, helmet: bool = False) -> None:
+def _head(b: MeshBuilder, neck: Point, s: float, style: Appearance, helmet: bool = False) -> None:
     """Neck, face and hair above the point `neck`; 0.25 m high for a grown person (s 1)."""
     x, y, z = neck
-    b.limb((x, y, z - 0.03 * s), (x + 0.01, y, z + 0.06 * s), 0.048 * s, 0.046 * s, looks.skin)
-    b.ball((x + 0.025 * s, y, z + 0.135 * s), (0.098 * s, 0.078 * s, 0.115 * s), looks.skin)
-    cover = looks.helmet if helmet and looks.helmet is not None else looks.hat
-    if helmet and looks.helmet is not None:
-        b.ball((x + 0.005 * s, y, z + 0.175 * s), (0.135 * s, 0.1 * s, 0.085 * s), looks.helmet, 1)
+    b.limb((x, y, z - 0.03 * s), (x + 0.01, y, z + 0.06 * s), 0.048 * s, 0.046 * s, style.skin)
+    b.ball((x + 0.025 * s, y, z + 0.135 * s), (0.098 * s, 0.078 * s, 0.115 * s), style.skin)
+    cover = style.helmet if helmet and style.helmet is not None else style.hat
+    if helmet and style.helmet is not None:
+        b.ball((x + 0.005 * s, y, z + 0.175 * s), (0.135 * s, 0.1 * s, 0.085 * s), style.helmet, 1)
     elif cover is not None:
         b.ball((x + 0.005 * s, y, z + 0.18 * s), (0.112 * s, 0.092 * s, 0.075 * s), cover, 1)
     else:
-        b.ball((x - 0.005 * s, y, z + 0.165 * s), (0.105 * s, 0.09 * s, 0.088 * s), looks.hair)
-    if looks.long_hair:
+        b.ball((x - 0.005 * s, y, z + 0.165 * s), (0.105 * s, 0.09 * s, 0.088 * s), style.hair)
+    if style.long_hair:
         b.limb(
             (x - 0.06 * s, y, z + 0.13 * s), (x - 0.075 * s, y, z - 0.03 * s),
-            0.07 * s, 0.05 * s, looks.hair,
+            0.07 * s, 0.05 * s, style.hair,
         )  # fmt: skip
 
 
-def head(b: Builder, neck: Point, s: float, looks: Looks) -> None:
+def head(b: MeshBuilder, neck: Point, s: float, style: Appearance) -> None:
     """A head with the helmet that its owner may wear."""
-    _head(b, neck, s, looks, helmet=True)
+    _head(b, neck, s, style, helmet=True)
 
 
-def _wheelchair(size_m: tuple[float, float, float], looks: Looks, way_m: float, sides: int) -> Mesh:
+def _wheelchair(
+    size_m: tuple[float, float, float], style: Appearance, travel_m: float, sides: int
+) -> Mesh:
     """A wheelchair and who sits in it, 1.1 x 0.65 x 1.3 m, stretched to `size_m`."""
-    b = Builder(sides)
-    frame: Rgb = (54, 58, 66) if looks.girth < 1 else (120, 40, 44)
-    turned = way_m / 0.3
+    b = MeshBuilder(sides)
+    frame: Rgb = (54, 58, 66) if style.girth < 1 else (120, 40, 44)
+    turned = travel_m / 0.3
     for side in (1.0, -1.0):
         y = 0.285 * side
         b.wheel((-0.2, y, 0.3), 0.3, 0.016, RUBBER, spokes=5, turned=turned)
@@ -230,22 +238,22 @@ def _wheelchair(size_m: tuple[float, float, float], looks: Looks, way_m: float, 
             (0.3, 0.11 * side, 0.58),
             (0.4, 0.11 * side, 0.2),
         )
-        b.limb(hip, knee, 0.085, 0.065, looks.legs)
-        b.limb(knee, ankle, 0.06, 0.045, looks.legs)
-        b.limb(ankle, (0.51, 0.11 * side, 0.155), 0.042, 0.036, looks.shoes)
+        b.limb(hip, knee, 0.085, 0.065, style.legs)
+        b.limb(knee, ankle, 0.06, 0.045, style.legs)
+        b.limb(ankle, (0.51, 0.11 * side, 0.155), 0.042, 0.036, style.shoes)
         push = 0.16 * math.sin(turned * 0.8)
         elbow, hand = (-0.28 + push * 0.3, 0.28 * side, 0.78), (-0.14 + push, 0.29 * side, 0.6)
-        b.limb((-0.2, 0.185 * side, 1.02), elbow, 0.052, 0.042, looks.top)
-        b.limb(elbow, hand, 0.04, 0.034, looks.top if looks.sleeves else looks.skin)
-        b.limb(hand, hand, 0.042, 0.042, looks.skin)
+        b.limb((-0.2, 0.185 * side, 1.02), elbow, 0.052, 0.042, style.top)
+        b.limb(elbow, hand, 0.04, 0.034, style.top if style.sleeves else style.skin)
+        b.limb(hand, hand, 0.042, 0.042, style.skin)
     b.box((-0.28, -0.21, 0.44), (0.24, 0.21, 0.49), (44, 44, 48))
     b.loft([(-0.27, 0, 0.46), (-0.36, 0, 0.92)], [[0.2, 0.02], [0.2, 0.02]], (40, 42, 46), sides=8)
     back = ((-0.16, 0.5), (-0.17, 0.62), (-0.19, 0.86), (-0.2, 1.0), (-0.2, 1.07), (-0.19, 1.1))
     b.loft(
         [(x, 0, z) for x, z in back],
         [[0.16, 0.12], [0.155, 0.115], [0.17, 0.12], [0.175, 0.105], [0.13, 0.08], [0.05, 0.05]],
-        looks.top,
+        style.top,
     )
-    _head(b, (-0.18, 0.0, 1.07), 0.92, looks)
+    _head(b, (-0.18, 0.0, 1.07), 0.92, style)
     stretch = (size_m[0] / 1.1, size_m[1] / 0.65, size_m[2] / 1.31)
     return b.build().placed((0.0, 0.0), 0.0, stretch)

@@ -22,7 +22,7 @@ _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
 
 @dataclass(frozen=True)
-class Mix:
+class SceneMix:
     """How much there is of what is rare and hard to tell, in random scenarios and streets."""
 
     scooters: float = 0.25  #: share of e-scooters among the cyclists
@@ -31,10 +31,10 @@ class Mix:
     clutter: int = 0  #: a street has up to this many more bollards, bins and signs near the camera
 
 
-USUAL_MIX = Mix()
+DEFAULT_MIX = SceneMix()
 
 
-def random_scenario(seed: int, mix: Mix = USUAL_MIX) -> Scenario:
+def random_scenario(seed: int, mix: SceneMix = DEFAULT_MIX) -> Scenario:
     """A scenario of 6 s: walkers, children, wheelchairs, cyclists, e-scooters and vehicles, none to
     a crowd, 1.5 to 40 m before the usual camera, in all directions, some standing still.
     """

@@ -25,7 +25,7 @@ class Sprite:
     """`colour` [h, w, 3] uint8, already multiplied by `alpha` [h, w] uint8 (255 is covered), with
     its upper left corner at pixel (`left`, `top`), which may lie outside the picture.
 
-    `full_box_px`: u1, v1, u2, v2 of the whole silhouette; `away_m`: distance that decides who
+    `full_box_px`: u1, v1, u2, v2 of the whole silhouette; `distance_m`: distance that decides who
     hides whom.
     """
 
@@ -34,7 +34,7 @@ class Sprite:
     colour: ImageArray
     alpha: ImageArray
     full_box_px: tuple[float, float, float, float]
-    away_m: float
+    distance_m: float
 
     @property
     def area_px(self) -> float:
@@ -48,7 +48,7 @@ def rasterise(
     light: Lighting,
     *,
     local: FloatArray | None = None,
-    away_m: float,
+    distance_m: float,
 ) -> Sprite | None:
     """Draws `mesh` (world metres); None when nothing of it is in or near the picture.
 
@@ -62,7 +62,7 @@ def rasterise(
         return None
     pixels: FloatArray = view.pixels(quads[facing].reshape(-1, 3)).reshape(-1, 4, 2)
     kept = np.flatnonzero(facing)
-    whole = _whole(pixels)
+    whole = _finite_faces(pixels)
     if not whole.all():
         kept, pixels = kept[whole], pixels[whole]
     if len(kept) == 0:
@@ -76,7 +76,7 @@ def rasterise(
     sight = 0.25 * (part[:, 0] + part[:, 1] + part[:, 2] + part[:, 3]) - eye
     away = np.einsum("ij,ij->i", sight, sight)
     order = np.lexsort((-away, mesh.layer[kept]))
-    colour = shaded(mesh, normal, kept, light, local)[order]
+    colour = shade_faces(mesh, normal, kept, light, local)[order]
     scale = _supersampling(float((high - low).max()))
     fixed = np.round(
         ((pixels[order] - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)
@@ -92,11 +92,11 @@ def rasterise(
     box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     return Sprite(
         left, top, np.ascontiguousarray(canvas[..., :3]), np.ascontiguousarray(canvas[..., 3]),
-        box, away_m,
+        box, distance_m,
     )  # fmt: skip
 
 
-def shaded(
+def shade_faces(
     mesh: Mesh,
     normal: FloatArray,
     kept: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
@@ -128,7 +128,7 @@ def shadow(
     flat[..., :2] -= lit[..., 2:] * slope
     flat[..., 2] = 0
     pixels: FloatArray = view.pixels(flat.reshape(-1, 3)).reshape(-1, 4, 2)
-    pixels = pixels[_whole(pixels)]
+    pixels = pixels[_finite_faces(pixels)]
     if len(pixels) == 0:
         return None
     bounds = _bounds(*_extent(pixels), view.size, beyond=0.0)
@@ -177,7 +177,7 @@ def inside(
     )
 
 
-def _whole(pixels: FloatArray) -> BoolArray:
+def _finite_faces(pixels: FloatArray) -> BoolArray:
     """Which faces [n, 4, 2] have all their corners."""
     flat = pixels.reshape(-1, 8)
     return np.isfinite(flat @ np.ones(8))

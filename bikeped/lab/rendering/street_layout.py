@@ -40,7 +40,7 @@ class House:
 
 
 @dataclass(frozen=True)
-class Place:
+class StreetLayout:
     """Everything that stays. Metres in the world frame."""
 
     number: int
@@ -67,50 +67,50 @@ _WALLS: tuple[Rgb, ...] = (
 )  # fmt: skip
 
 
-def place(number: int, clutter: int = 0) -> Place:
+def street_layout(number: int, clutter: int = 0) -> StreetLayout:
     """The place of this number, the same each time, with `clutter` more things near the camera."""
     rng = np.random.default_rng((number, 5))
-    usual = number == 0
-    kerb = 6.1 if usual else float(rng.uniform(4.9, 8.0))
-    walk = 4.0 if usual else float(rng.uniform(2.6, 5.0))
-    side = (-7.6, -1.2) if usual or rng.random() < 0.6 else None
-    if side is not None and not usual:
+    plain = number == 0
+    kerb = 6.1 if plain else float(rng.uniform(4.9, 8.0))
+    walk = 4.0 if plain else float(rng.uniform(2.6, 5.0))
+    side = (-7.6, -1.2) if plain or rng.random() < 0.6 else None
+    if side is not None and not plain:
         middle, half = float(rng.uniform(-18, -6)), float(rng.uniform(2.8, 4.2))
         middle = middle if rng.random() < 0.6 else 10 - middle
         side = (middle - half, middle + half)
-    half_walk = 1.7 if usual else float(rng.uniform(1.3, 2.2))
-    cross = CROSSING_X_M + (0.0 if usual else float(rng.uniform(-6, 6)))
-    grey = float(rng.uniform(-16, 14)) if not usual else 0.0
+    half_walk = 1.7 if plain else float(rng.uniform(1.3, 2.2))
+    cross = CROSSING_X_M + (0.0 if plain else float(rng.uniform(-6, 6)))
+    grey = float(rng.uniform(-16, 14)) if not plain else 0.0
     asphalt = (98 + grey, 100 + grey, 104 + grey)
     paving = (
         (168.0, 164.0, 156.0),
         (150.0, 148.0, 146.0),
         (176.0, 150.0, 130.0),
         (188.0, 184.0, 176.0),
-    )[0 if usual else int(rng.integers(4))]
+    )[0 if plain else int(rng.integers(4))]
     verge = (
         (104.0, 128.0, 74.0),
         (128.0, 126.0, 92.0),
         (158.0, 154.0, 148.0),
         (86.0, 110.0, 64.0),
-    )[0 if usual else int(rng.integers(4))]
-    return Place(
+    )[0 if plain else int(rng.integers(4))]
+    return StreetLayout(
         number=number,
         kerb=kerb,
         walk=walk,
         side_street=side,
         crosswalk=(cross - half_walk, cross + half_walk),
-        crosswalk_style="bars" if usual else str(rng.choice(["bars", "ladder", "lines", "worn"])),
-        bike_lanes=usual or bool(rng.random() < 0.7),
-        green_lanes=usual or bool(rng.random() < 0.4),
-        lane_m=2.2 if usual else float(rng.uniform(0.36, 0.42)) * kerb,
+        crosswalk_style="bars" if plain else str(rng.choice(["bars", "ladder", "lines", "worn"])),
+        bike_lanes=plain or bool(rng.random() < 0.7),
+        green_lanes=plain or bool(rng.random() < 0.4),
+        lane_m=2.2 if plain else float(rng.uniform(0.36, 0.42)) * kerb,
         asphalt=asphalt,
         paving=paving,
         verge=verge,
-        slab_m=0.9 if usual else float(rng.choice([0.5, 0.75, 1.2, 1.5])),
-        yellow_centre=usual or bool(rng.random() < 0.5),
+        slab_m=0.9 if plain else float(rng.choice([0.5, 0.75, 1.2, 1.5])),
+        yellow_centre=plain or bool(rng.random() < 0.5),
         houses=_houses(rng, kerb + walk, side),
-        fixtures=_fixtures(rng, usual, kerb, walk, side, cross) + _clutter(number, clutter, kerb),
+        fixtures=_fixtures(rng, plain, kerb, walk, side, cross) + _clutter(number, clutter, kerb),
     )
 
 
@@ -146,7 +146,7 @@ def _houses(
 
 def _fixtures(
     rng: np.random.Generator,
-    usual: bool,
+    plain: bool,
     kerb: float,
     walk: float,
     side: tuple[float, float] | None,
@@ -162,20 +162,20 @@ def _fixtures(
 
     for x in np.arange(-40, 50, float(rng.uniform(14, 22))).tolist():
         put("lamp", x + 9.5, kerb + 0.6, -np.pi / 2)
-    trees = 9.0 if usual else float(rng.uniform(6, 26))
+    trees = 9.0 if plain else float(rng.uniform(6, 26))
     for x in np.arange(-60, 70, trees).tolist():
         x += float(rng.uniform(-1.5, 1.5)) + 2.0
         if abs(x - cross) > 3.2:
             put("tree", x, kerb + walk - 0.5)
     put("signal", cross + 2.9, kerb + 0.5, -np.pi / 2)
-    if usual or rng.random() < 0.6:
+    if plain or rng.random() < 0.6:
         put("signal", cross - 2.9, -kerb - 0.5, np.pi / 2)
     put("bin", float(rng.uniform(8, 14)), kerb + walk - 0.4)
     put("hydrant", float(rng.uniform(9, 16)), kerb + 0.5)
-    if usual or rng.random() < 0.6:
+    if plain or rng.random() < 0.6:
         put("sign", cross + float(rng.uniform(3.5, 9)), -kerb - 0.5, np.pi)
-    parked = [(14.0, 1), (20.5, 1), (-14.5, 1)] if usual else []
-    if not usual:
+    parked = [(14.0, 1), (20.5, 1), (-14.5, 1)] if plain else []
+    if not plain:
         for way in (1, -1):
             if rng.random() < 0.55:
                 parked += [
@@ -193,7 +193,7 @@ def _fixtures(
 
 
 def _clutter(number: int, count: int, kerb: float) -> tuple[Fixture, ...]:
-    """Things of a person's size below the usual camera, also where no city would put them."""
+    """Things of a person's size below the default camera, also where no city would put them."""
     rng = np.random.default_rng((number, 97))
     return tuple(
         Fixture(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bikeped.lab.rendering.mesh import Builder, Mesh, Rgb
+from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Rgb
 from bikeped.lab.rendering.people import RUBBER
 
 PAINTS: tuple[Rgb, ...] = (
@@ -59,7 +59,7 @@ def vehicle(kind: str, size_m: tuple[float, float, float], number: int) -> Mesh:
 def _car(
     stations: tuple[tuple[float, float, float, float, float, float, str], ...], paint: Rgb
 ) -> Mesh:
-    b = Builder()
+    b = MeshBuilder()
     light = tuple(min(c * 1.06 + 4, 250) for c in paint)
     rows = []
     for x, sill, waist, roof, wide, top, _ in stations:
@@ -123,7 +123,7 @@ def _car(
 
 
 def _panels(
-    b: Builder, x0: float, x1: float, z0: float, z1: float, half: float, colour: Rgb,
+    b: MeshBuilder, x0: float, x1: float, z0: float, z1: float, half: float, colour: Rgb,
     *, count: int, gap: float, layer: int = 1, glow: float = 0.0,
 ) -> None:  # fmt: skip
     """Windows along both sides."""
@@ -136,7 +136,7 @@ def _panels(
         )
 
 
-def _big_wheel(b: Builder, x: float, half: float, radius: float) -> None:
+def _big_wheel(b: MeshBuilder, x: float, half: float, radius: float) -> None:
     for side in (1, -1):
         b.disc((x, side * (half + 0.005), radius + 0.04), radius + 0.06, side, _DARK, layer=1)
         b.wheel((x, side * (half - 0.15), radius), radius, 0.14, RUBBER, steps=18)
@@ -145,7 +145,7 @@ def _big_wheel(b: Builder, x: float, half: float, radius: float) -> None:
 
 
 def _bus(number: int) -> Mesh:
-    b = Builder()
+    b = MeshBuilder()
     paint = ((206, 60, 48), (60, 110, 170), (228, 228, 222), (70, 140, 90), (226, 176, 60))[
         number % 5
     ]
@@ -209,7 +209,7 @@ def _bus(number: int) -> Mesh:
 
 
 def _truck(number: int) -> Mesh:
-    b = Builder()
+    b = MeshBuilder()
     cab = PAINTS[(number + 3) % len(PAINTS)]
     load = ((226, 226, 222), (176, 180, 184), (90, 120, 150), (196, 150, 90))[number % 4]
     w = 1.25
@@ -233,7 +233,7 @@ def _truck(number: int) -> Mesh:
     return b.build()
 
 
-def _ends(b: Builder, f: float, w: float, z: float) -> None:
+def _ends(b: MeshBuilder, f: float, w: float, z: float) -> None:
     """Head and tail lamps."""
     for side in (1, -1):
         y0, y1 = sorted((side * w * 0.55, side * w * 0.9))

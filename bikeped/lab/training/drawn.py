@@ -22,14 +22,14 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import DataSetError
 from bikeped.files import make_folder
 from bikeped.geometry import CameraPose
-from bikeped.lab.rendering import DEFAULT_POSE, Mix, SceneCamera, scene_camera, write_dataset
+from bikeped.lab.rendering import DEFAULT_POSE, SceneCamera, SceneMix, scene_camera, write_dataset
 from bikeped.lab.training.coco import write_annotations
 
 #: Seeds of parts begin here, so that no set shares a street with another: training from
 #: `seed` * this, below the next one.
 SEEDS_A_SET = 10_000
 #: More of what is hard to tell than in the streets that a detector is tested on.
-HARD_MIX = Mix(scooters=0.4, wheelchairs=0.2, beside=0.45, clutter=9)
+HARD_MIX = SceneMix(scooters=0.4, wheelchairs=0.2, beside=0.45, clutter=9)
 _SMALL, _LARGE = (1280, 720), (1920, 1080)
 
 
@@ -43,7 +43,7 @@ class DrawnSettings:
     configured: float = 0.9  #: share of parts seen by the configured camera
     large: float = 0.75  #: share of parts drawn at 1920 x 1080, the others at 1280 x 720
     lens: str = "fisheye"  #: of the other cameras: fisheye or rectilinear
-    mix: Mix = HARD_MIX
+    mix: SceneMix = HARD_MIX
     processes: int = 2
 
 

@@ -13,7 +13,7 @@ from bikeped.config import load_config
 from bikeped.geometry import GroundCamera
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, ScenePainter, scene_camera
 from bikeped.lab.rendering.conditions import lighting
-from bikeped.lab.rendering.people import Looks, person
+from bikeped.lab.rendering.people import Appearance, person
 from bikeped.lab.rendering.sprite import rasterise
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.types import FloatArray, Kind
@@ -33,14 +33,14 @@ def view() -> SceneCamera:
 def standing(
     number: int,
     kind: str,
-    away_m: float,
+    distance_m: float,
     bearing_deg: float = 0.0,
     heading_deg: float = 0.0,
     size: tuple[float, float, float] | None = None,
 ) -> Agent:
-    """Somebody who is `away_m` before the usual camera at one second, hardly moving."""
+    """Somebody who is `distance_m` before the usual camera at one second, hardly moving."""
     b, h = math.radians(bearing_deg), math.radians(heading_deg)
-    x, y = 5 + away_m * math.sin(b), -13 + away_m * math.cos(b)
+    x, y = 5 + distance_m * math.sin(b), -13 + distance_m * math.cos(b)
     dx, dy = 0.01 * math.cos(h), 0.01 * math.sin(h)
     path = np.array([[0.0, x - dx, y - dy], [2.0, x + dx, y + dy]])
     return Agent(number, kind, path, size or SIZES_M[kind])
@@ -79,24 +79,24 @@ WHO = st.sampled_from(
 @settings(max_examples=40, deadline=None)
 @given(
     who=WHO,
-    away_m=st.floats(7.0, 20.0),
+    distance_m=st.floats(7.0, 20.0),
     bearing_deg=st.floats(-55, 55),
     heading_deg=st.floats(-180, 180),
 )
 def test_boxes_stand_where_the_ground_model_says(
     view: SceneCamera,
     who: tuple[str, tuple[float, float, float] | None, float],
-    away_m: float,
+    distance_m: float,
     bearing_deg: float,
     heading_deg: float,
 ) -> None:
     kind, size, reach_m = who
-    agent = standing(1, kind, away_m, bearing_deg, heading_deg, size)
+    agent = standing(1, kind, distance_m, bearing_deg, heading_deg, size)
     item = seen(view, agent)[1]
     expected = corner_box(view, agent)
     full = np.array(item.full_box_px)
     # A body fills its box and does not leave it; shoes reach a little further than 0.3 m.
-    nearest_m = away_m - math.hypot(agent.size_m[0], agent.size_m[1]) / 2
+    nearest_m = distance_m - math.hypot(agent.size_m[0], agent.size_m[1]) / 2
     slack = 2.0 + 0.12 * view.focal_px / nearest_m
     assert (full[:2] >= expected[:2] - slack).all()
     assert (full[2:] <= expected[2:] + slack).all()
@@ -105,7 +105,7 @@ def test_boxes_stand_where_the_ground_model_says(
         middle = np.array([[(item.box_px[0] + item.box_px[2]) / 2, item.box_px[3]]])
         ground, valid = view.camera.ground(view.framing.frame_to_crop(middle))
         assert valid[0]
-        pixel_m = away_m**2 / (view.camera.height_m * view.focal_px)
+        pixel_m = distance_m**2 / (view.camera.height_m * view.focal_px)
         assert math.dist(ground[0], item.xy_m) < reach_m + pixel_m
 
 
@@ -123,8 +123,8 @@ def test_labels_give_the_scenarios_truth(view: SceneCamera) -> None:
 
 
 def test_a_box_is_the_silhouettes(view: SceneCamera) -> None:
-    mesh = person((0.3, 0.5, 1.7), Looks.of(np.random.default_rng(1)), 0.4, True)
-    sprite = rasterise(mesh.placed((6.0, -6.0), 1.0), view, lighting(PLAIN), away_m=7.0)
+    mesh = person((0.3, 0.5, 1.7), Appearance.random(np.random.default_rng(1)), 0.4, True)
+    sprite = rasterise(mesh.placed((6.0, -6.0), 1.0), view, lighting(PLAIN), distance_m=7.0)
     assert sprite is not None
     covered = sprite.alpha >= 100
     rows, columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
@@ -140,7 +140,7 @@ def test_a_box_is_the_silhouettes(view: SceneCamera) -> None:
 
 
 def test_feet_are_on_the_ground_at_every_step() -> None:
-    looks = Looks.of(np.random.default_rng(5))
+    looks = Appearance.random(np.random.default_rng(5))
     for way in np.linspace(0, 1.42, 15):
         low = person((0.3, 0.5, 1.7), looks, float(way), True).quads[..., 2].min()
         assert low == pytest.approx(0.0, abs=0.006)

@@ -15,8 +15,8 @@ from bikeped.geometry import Lens
 from bikeped.lab.rendering import (
     LIGHTS,
     Conditions,
-    Mix,
     SceneCamera,
+    SceneMix,
     ScenePainter,
     lens_camera,
     random_camera,
@@ -26,10 +26,10 @@ from bikeped.lab.rendering import (
     scene_camera,
 )
 from bikeped.lab.rendering.backdrop import backdrop
-from bikeped.lab.rendering.compositing import paste
+from bikeped.lab.rendering.compositing import paste_sprite
 from bikeped.lab.rendering.render_camera import rays
 from bikeped.lab.rendering.sprite import Sprite
-from bikeped.lab.rendering.street_layout import place
+from bikeped.lab.rendering.street_layout import street_layout
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenario
 from bikeped.types import ImageArray
 
@@ -97,7 +97,7 @@ def test_a_figure_is_as_dark_as_the_lens_is_at_each_of_its_pixels(
     whole = np.full((30, 30), 255, np.uint8)
     figure = Sprite(spot[1].start, 120, cv2.merge([whole - 55] * 3), whole, (0, 0, 1, 1), 1.0)
     image = np.zeros((*SIZE[::-1], 3), np.uint8)
-    paste(image, street, figure)
+    paste_sprite(image, street, figure)
     assert np.abs(image[spot] - 200.0 * street.vignette[spot][..., None]).max() < 10
     assert image[spot].max() > 100
     assert (image[spot].min() < 5) == (middle_u == 19)
@@ -258,20 +258,20 @@ def test_random_draws_repeat_and_differ() -> None:
 
 
 def test_as_many_e_scooters_and_wheelchairs_as_asked_for() -> None:
-    def share(kind: str, length_m: float, mix: Mix) -> float:
+    def share(kind: str, length_m: float, mix: SceneMix) -> float:
         agents = [a for i in range(150) for a in random_scenario(i, mix).agents]
         found = [a.size_m[0] == length_m for a in agents if a.kind == kind]
         return sum(found) / len(found)
 
-    assert share("cyclist", 1.2, Mix(scooters=0.0)) == 0.0
-    assert share("cyclist", 1.2, Mix(scooters=1.0)) == 1.0
-    assert 0.35 < share("cyclist", 1.2, Mix(scooters=0.45)) < 0.55
-    assert share("pedestrian", 1.1, Mix(wheelchairs=0.0)) == 0.0
-    assert 0.25 < share("pedestrian", 1.1, Mix(wheelchairs=0.3)) < 0.35
+    assert share("cyclist", 1.2, SceneMix(scooters=0.0)) == 0.0
+    assert share("cyclist", 1.2, SceneMix(scooters=1.0)) == 1.0
+    assert 0.35 < share("cyclist", 1.2, SceneMix(scooters=0.45)) < 0.55
+    assert share("pedestrian", 1.1, SceneMix(wheelchairs=0.0)) == 0.0
+    assert 0.25 < share("pedestrian", 1.1, SceneMix(wheelchairs=0.3)) < 0.35
 
 
 def test_clutter_adds_things_near_the_camera_and_leaves_the_rest() -> None:
-    plain, full = place(7), place(7, 5)
+    plain, full = street_layout(7), street_layout(7, 5)
     assert full.fixtures[: len(plain.fixtures)] == plain.fixtures
     more = full.fixtures[len(plain.fixtures) :]
     assert len(more) == 5
