@@ -43,6 +43,7 @@ _FOLDERS = (Path(__file__).parent, WEB_FOLDER)  #: with `static/` and `templates
 #: In the order in which they need one another.
 _SCRIPTS = (
     "ui.js",
+    "canvas.js",
     "testbench-words.js",
     "testbench-timeline.js",
     "testbench-plan.js",

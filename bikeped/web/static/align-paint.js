@@ -1,5 +1,7 @@
 // Drawing of the picture, the grid and what belongs to the marks, at any scale: stage and loupe alike.
 
+import { circle, line } from "/static/canvas.js";
+
 export const KINDS = {
   metre: { label: "1 m", colour: "#e6ecf0", width: 0.8, alpha: 0.65 },
   five: { label: "5 m", colour: "#ffffff", width: 1.3, alpha: 0.95 },
@@ -9,9 +11,10 @@ export const KINDS = {
   circle: { label: "Lens circle", colour: "#ffffff", width: 1.5, alpha: 0.9 },
 };
 const LOUPE_PX = 132;
+const DARK = "#0a0d10";
 
 // The picture with its top left corner at (left, top), `scale` screen pixels to one of its own.
-export function scene(view, context, scale, left, top) {
+export function drawScene(view, context, scale, left, top) {
   const dots = scale * (window.devicePixelRatio || 1);
   const level = Math.min(view.levels.length - 1, Math.max(0, Math.floor(Math.log2(1 / dots))));
   context.imageSmoothingEnabled = scale < 3;
@@ -66,58 +69,36 @@ function drawLabels(view, context, at) {
 // The optical centre, what read 10 m before, and where each measurement would lie.
 function drawPoints(view, context, at) {
   const ring = (point, radius, colour) => {
-    const [x, y] = at(point);
-    for (const [style, width] of [["#0a0d10", 5], [colour, 2.5]]) {
-      context.beginPath();
-      context.arc(x, y, radius, 0, 7);
-      context.strokeStyle = style;
-      context.lineWidth = width;
-      context.stroke();
-    }
+    circle(context, at(point), radius, { stroke: DARK, width: 5 });
+    circle(context, at(point), radius, { stroke: colour, width: 2.5 });
   };
   if (view.centre && !view.hidden.has("circle")) {
     const [x, y] = at(view.centre);
-    for (const [style, width] of [["#0a0d10", 4], ["#fff", 1.5]]) {
-      context.beginPath();
-      context.moveTo(x - 7, y); context.lineTo(x + 7, y);
-      context.moveTo(x, y - 7); context.lineTo(x, y + 7);
-      context.strokeStyle = style;
-      context.lineWidth = width;
-      context.stroke();
-    }
+    outlined(context, [[x - 7, y], [x + 7, y], null, [x, y - 7], [x, y + 7]], [4, DARK], [1.5, "#fff"]);
   }
   if (view.ten) ring(view.ten, 9, "#35b5f2");
   for (const mark of view.marks) {
     if (!mark.goal) continue;
-    const [x, y] = at([mark.u, mark.v]), [gx, gy] = at(mark.goal);
-    for (const [style, width] of [["#0a0d10", 5], ["#ffd028", 2]]) {
-      context.beginPath();
-      context.moveTo(x, y);
-      context.lineTo(gx, gy);
-      context.strokeStyle = style;
-      context.lineWidth = width;
-      context.stroke();
-    }
+    outlined(context, [at([mark.u, mark.v]), at(mark.goal)], [5, DARK], [2, "#ffd028"]);
     ring(mark.goal, 4, "#ffd028");
   }
 }
 
-export function loupe(view, mark) {
+// A line in each of [width, colour], one over the other.
+function outlined(context, points, ...styles) {
+  for (const [width, stroke] of styles) line(context, points, { stroke, width });
+}
+
+// The picture around a mark, enlarged, with a cross at the mark.
+export function drawLoupe(view, mark) {
   const dots = Math.min(window.devicePixelRatio || 1, 3);
   const canvas = view.loupe, scale = Math.max(3 * view.scale, 1);
   canvas.width = canvas.height = LOUPE_PX * dots;
   const context = canvas.getContext("2d");
   context.setTransform(dots, 0, 0, dots, 0, 0);
   const half = LOUPE_PX / 2;
-  scene(view, context, scale, half - (mark.u + 0.5) * scale, half - (mark.v + 0.5) * scale);
-  for (const [style, width] of [["#0a0d10", 3], ["#ff5a3c", 1]]) {
-    context.beginPath();
-    for (const [a, b] of [[12, half - 5], [half + 5, LOUPE_PX - 12]]) {
-      context.moveTo(a, half); context.lineTo(b, half);
-      context.moveTo(half, a); context.lineTo(half, b);
-    }
-    context.strokeStyle = style;
-    context.lineWidth = width;
-    context.stroke();
-  }
+  drawScene(view, context, scale, half - (mark.u + 0.5) * scale, half - (mark.v + 0.5) * scale);
+  const arms = [[12, half - 5], [half + 5, LOUPE_PX - 12]];
+  const cross = arms.flatMap(([a, b]) => [[a, half], [b, half], null, [half, a], [half, b], null]);
+  outlined(context, cross, [3, DARK], [1, "#ff5a3c"]);
 }

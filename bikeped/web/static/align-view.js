@@ -1,7 +1,7 @@
 // The picture with the grid and the marks: zoom, pan, drag, draw. It knows pixels, no metres and no
 // lens: all lines come from the box. Frame pixel (u, v) has its middle at the integer.
 
-import { loupe, scene } from "/static/align-paint.js";
+import { drawLoupe, drawScene } from "/static/align-paint.js";
 import { canvasOf, el, svg } from "/static/ui.js";
 
 const TAP_PX = 8; // a finger that moves less has not moved
@@ -149,7 +149,7 @@ export class View {
 
   draw(context) {
     if (!this.size || !this.scale) return;
-    scene(this, context, this.scale, this.left, this.top);
+    drawScene(this, context, this.scale, this.left, this.top);
     Object.assign(this.stage.dataset, { scale: this.scale, left: this.left, top: this.top });
   }
 
@@ -233,7 +233,7 @@ export class View {
         this.move(held.mark, held.u + (x - held.x) / this.scale, held.v + (y - held.y) / this.scale);
         this.loupe.hidden = false;
         this.loupe.classList.toggle("right", x < this.width / 2);
-        loupe(this, held.mark);
+        drawLoupe(this, held.mark);
         return;
       }
       if (still && Math.hypot(x - last[0], y - last[1]) < TAP_PX) return;

@@ -6,7 +6,7 @@ import { MarkList } from "/static/align-marks.js";
 import { KINDS } from "/static/align-paint.js";
 import { View } from "/static/align-view.js";
 import { NAMES, rounded, sign } from "/static/align-words.js";
-import { $, announce, el, metres, request, setText, toast } from "/static/ui.js";
+import { $, announce, download, el, metres, request, setText, toast } from "/static/ui.js";
 
 let box = null; // what /align/state said
 let before = null; // the numbers before the last fit
@@ -300,9 +300,7 @@ async function newPicture() {
 
 function exportMarks() {
   const text = `${JSON.stringify(points(), null, 2)}\n`;
-  const link = el("a", { href: URL.createObjectURL(new Blob([text], { type: "application/json" })), download: "points.json" });
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  download(text, "points.json", "application/json");
 }
 
 async function importMarks(file) {

@@ -88,7 +88,7 @@ function takeNow(data) {
   $("#live").dataset.contact = "live";
   lostSince = null;
   radar.setLive(true);
-  showState(data.signal, data.sentence || STATES[data.signal]?.word || data.signal);
+  showState(data.signal, data.sentence || STATES[data.signal] || data.signal);
   setText($("#light-now"), lightWords(data));
   $("#state-facts").hidden = false;
   showPair(data);
@@ -153,7 +153,7 @@ function say(text) {
 }
 
 function showState(name, sentence) {
-  const word = STATES[name]?.word ?? name;
+  const word = STATES[name] ?? name;
   if (name !== shown) {
     shown = name;
     since = performance.now();

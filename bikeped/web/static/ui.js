@@ -30,15 +30,16 @@ export function setText(node, text) {
 
 // --- requests
 
-export class RequestError extends Error {
+class RequestError extends Error {
   constructor(message, status) {
     super(message);
     this.status = status;
   }
 }
 
-// Asks the box: request("/align/fit", {json: {...}}) posts, without `json` it gets. The answer's JSON
-// (or text); RequestError with a line for people otherwise. Without a session the login page opens.
+// request("/align/fit", {json: {...}}) posts to the server, without `json` it gets. Returns the answer's
+// JSON (or text), or throws an error with `status` and a readable message. Without a session the login
+// page opens.
 export async function request(path, { json, method, signal } = {}) {
   const options = { method: method ?? (json === undefined ? "GET" : "POST"), signal, headers: { Accept: "application/json" } };
   if (json !== undefined) {
@@ -80,6 +81,13 @@ export function toast(text, kind = "") {
   setTimeout(() => node.remove(), kind === "bad" ? 9000 : 4000);
 }
 
+// Saves a text as a file of the visitor's.
+export function download(text, name, type) {
+  const link = el("a", { href: URL.createObjectURL(new Blob([text], { type })), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
 // --- formats: a figure with its unit, a dash where there is none
 
 const known = (value) => typeof value === "number" && Number.isFinite(value);
@@ -101,15 +109,7 @@ export function duration(value) {
 
 // --- states: never by colour alone
 
-export const STATES = {
-  IDLE: { word: "Idle", colour: "--idle", ink: "--on-idle" },
-  SAFE: { word: "Safe", colour: "--safe", ink: "--on-safe" },
-  WARNING: { word: "Warning", colour: "--warning", ink: "--on-warning" },
-  ALERT: { word: "Alert", colour: "--alert", ink: "--on-alert" },
-  FAULT: { word: "Fault", colour: "--fault", ink: "--on-fault" },
-  OFF: { word: "Off", colour: "--off", ink: "--on-off" },
-  STALE: { word: "No contact", colour: "--stale", ink: "--on-stale" },
-};
+export const STATES = { IDLE: "Idle", SAFE: "Safe", WARNING: "Warning", ALERT: "Alert", FAULT: "Fault", OFF: "Off", STALE: "No contact" };
 
 // The state's shape: ring, disc, triangle, octagon, hatched square, bar, broken ring.
 export function stateIcon(name) {
@@ -125,21 +125,12 @@ export function stateIcon(name) {
   return svg("svg", { viewBox: "0 0 24 24", class: "state-icon", "aria-hidden": "true" }, shapes[name] ?? shapes.STALE);
 }
 
-// Icon and word, in a line of text.
-export function stateChip(name) {
-  return el("span", { class: "state-chip", "data-state": name }, stateIcon(name), STATES[name]?.word ?? name);
-}
-
 // --- colours and canvases
 
 // The value of a custom property, e.g. colour("--ink").
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-const themed = new Set();
-// Calls `redraw` whenever the colours change.
-export function onTheme(redraw) {
-  themed.add(redraw);
-}
+const themed = new Set(); // what is drawn anew when the colours change
 
 // Keeps a canvas as sharp as the screen: `draw(context, width, height)` in CSS pixels, called at every
 // change of size or theme. Returns the function that draws anew.
@@ -160,7 +151,7 @@ export function canvasOf(canvas, draw) {
     canvas.height = Math.max(1, Math.round(height * scale));
     paint();
   }).observe(canvas);
-  onTheme(paint);
+  themed.add(paint);
   return paint;
 }
 

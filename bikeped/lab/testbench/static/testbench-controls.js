@@ -57,7 +57,7 @@ const GROUPS = [
 
 const OPPOSITE = { x_m: 5, y_m: 13, heading_deg: 270 };
 
-export const get = (bench, key) => key.split(".").reduce((place, name) => place?.[name], bench);
+const get = (bench, key) => key.split(".").reduce((place, name) => place?.[name], bench);
 
 // A bench with one setting changed.
 export function set(bench, key, value) {

@@ -163,13 +163,13 @@ export function editor(host, change, actions) {
 }
 
 // Speed on the way to waypoint i.
-export function speedOf(path, i) {
+function speedOf(path, i) {
   const [t0, x0, y0] = path[i - 1], [t1, x1, y1] = path[i];
   return Math.hypot(x1 - x0, y1 - y0) / Math.max(t1 - t0, 1e-9);
 }
 
 // One number of a waypoint: 0 time, 1 east, 2 north, 3 speed. Later times follow.
-export function edit(path, i, what, value, keepSpeed) {
+function edit(path, i, what, value, keepSpeed) {
   if (what === 1 || what === 2) place(path, i, what === 1 ? value : path[i][1], what === 2 ? value : path[i][2], keepSpeed);
   else if (what === 3) {
     if (value <= 0) return;
@@ -182,7 +182,7 @@ export function edit(path, i, what, value, keepSpeed) {
 }
 
 // Moves a waypoint; with `keepSpeed` the times before and after it follow its new ways.
-export function place(path, i, x, y, keepSpeed) {
+function place(path, i, x, y, keepSpeed) {
   const before = i ? speedOf(path, i) : 0, after = i + 1 < path.length ? speedOf(path, i + 1) : 0;
   path[i][1] = x;
   path[i][2] = y;

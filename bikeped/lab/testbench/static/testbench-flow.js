@@ -85,8 +85,7 @@ function question(list, title, state, answer) {
 }
 
 function exit(state, answer) {
-  const word = STATES[state].word;
-  const chip = el("span", { class: "fl-exit", "data-state": state }, el("span", { class: "fl-answer" }, answer), stateIcon(state), el("span", {}, word));
+  const chip = el("span", { class: "fl-exit", "data-state": state }, el("span", { class: "fl-answer" }, answer), stateIcon(state), el("span", {}, STATES[state]));
   chip.append(el("span", { class: "unseen fl-now" }));
   return chip;
 }

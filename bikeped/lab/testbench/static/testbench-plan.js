@@ -1,13 +1,16 @@
-// The plan: agents, trails, cameras, rings, pairs; seen and true. North is up.
+// The plan view: road users with trails, cameras with rings, pairs; detected and true positions.
+// North is up.
 
+import { chip, circle, line, polygon, shape, text, traceLine } from "/static/canvas.js";
 import { canvasOf, colour } from "/static/ui.js";
 import { NAMES, chosenPair, pairsAt, stateAt, tracksAt } from "/static/testbench-words.js";
 
 const RINGS_M = [5, 10, 15, 20, 25];
 const TRAIL_S = 2;
+const TONES = ["ink", "soft", "line", "panel", "pedestrian", "cyclist", "vehicle", "sunk"];
 
-// `where()` gives {play, frame, editing}; `drag` = {pick(x, y, reach), move(handle, x, y), drop()} for
-// the editor, in metres.
+// `where()` gives {play, frame, editing, handles}; `drag` = {pick(x, y, reach), move(handle, x, y),
+// drop(), add(x, y)} edits paths, in metres.
 export function plan(canvas, where, drag = null) {
   let view = null; // {x, y, scale}: the middle in metres, pixels per metre
   let held = null, shown = "";
@@ -51,309 +54,184 @@ function fitted(play, width, height) {
   return { x: (x0 + x1) / 2, y: (y0 + y1) / 2, scale };
 }
 
+// What the drawing functions share: the canvas, its colours, and plan metres to pixels; `place` takes
+// the i-th of [x0, y0, x1, y1, ...], or is null where there is none.
+function sketchOf(context, width, height, view) {
+  const at = (x, y) => [width / 2 + (x - view.x) * view.scale, height / 2 - (y - view.y) * view.scale];
+  const place = (list, i) => (list[2 * i] ?? null) === null ? null : at(list[2 * i], list[2 * i + 1]);
+  const tones = Object.fromEntries(TONES.map((name) => [name, colour(`--${name}`)]));
+  return { context, width, height, view, scale: view.scale, at, place, tones };
+}
+
 function draw(context, width, height, view, { play, frame, editing, handles }) {
-  const px = (x) => width / 2 + (x - view.x) * view.scale;
-  const py = (y) => height / 2 - (y - view.y) * view.scale;
-  const side = play.sides[0];
-  const tone = {
-    ink: colour("--ink"), soft: colour("--soft"), line: colour("--line"), panel: colour("--panel"),
-    pedestrian: colour("--pedestrian"), cyclist: colour("--cyclist"), vehicle: colour("--vehicle"), sunk: colour("--sunk"),
-  };
+  const sketch = sketchOf(context, width, height, view);
   context.font = `12px ${colour("--sans")}`;
   context.textBaseline = "middle";
   context.lineJoin = "round";
-
-  context.fillStyle = tone.sunk;
+  context.fillStyle = sketch.tones.sunk;
   context.fillRect(0, 0, width, height);
-  for (const camera of play.cameras) drawGround(context, px, py, camera);
-  drawGrid(context, width, height, view, px, py, tone);
-  play.cameras.forEach((camera, i) => drawCamera(context, px, py, camera, view, tone, i, play.cameras.length));
-
+  for (const camera of play.cameras) drawGround(sketch, camera);
+  drawGrid(sketch);
+  play.cameras.forEach((camera, i) => drawCamera(sketch, camera, i, play.cameras.length));
   for (const agent of play.agents) {
-    drawPath(context, px, py, agent, tone);
-    drawTrail(context, px, py, agent, frame, play.fps, tone);
+    const path = agent.path.map(([, x, y]) => sketch.at(x, y));
+    line(context, path, { stroke: sketch.tones[agent.role], dash: [1, 4], alpha: 0.55 });
+    drawTrail(sketch, agent, frame, play.fps);
   }
   const tracks = tracksAt(play, frame);
-  const told = drawPairs(context, px, py, play, side, frame, tracks, tone);
-  for (const agent of play.agents) drawAgent(context, px, py, agent, frame, view.scale, tone);
-  for (const agent of play.agents) drawDetection(context, px, py, agent, frame, tone);
-  drawTracks(context, px, py, tracks, tone, told ? [[told.x - 26, told.y - 11, 52, 22]] : []);
-  if (told) {
-    context.textAlign = "center";
-    chip(context, told.text, told.x, told.y, told.fill, told.ink);
-  }
-  drawScale(context, width, height, view.scale, tone);
-  if (editing && handles) drawHandles(context, px, py, handles, tone);
+  const distance = drawPairs(sketch, play, play.sides[0], frame, tracks);
+  for (const agent of play.agents) drawAgent(sketch, agent, frame);
+  for (const agent of play.agents) drawDetection(sketch, agent, frame);
+  drawTracks(sketch, tracks, distance ? [[distance.at[0] - 26, distance.at[1] - 11, 52, 22]] : []);
+  if (distance) chip(context, distance.text, distance.at, { ...distance.colours, bold: true });
+  drawScale(sketch);
+  if (editing && handles) drawHandles(sketch, handles);
 }
 
 // The ground that the camera sees: paper on a darker floor.
-function drawGround(context, px, py, camera) {
-  const { near, far } = camera;
+function drawGround({ context, place }, { near, far }) {
   const count = near.length / 2;
-  context.fillStyle = colour("--seen");
-  context.beginPath();
-  for (let i = 0; i < count; i++) {
-    const j = (i + 1) % count;
-    if (near[2 * i] === null || near[2 * j] === null) continue;
-    context.moveTo(px(near[2 * i]), py(near[2 * i + 1]));
-    context.lineTo(px(far[2 * i]), py(far[2 * i + 1]));
-    context.lineTo(px(far[2 * j]), py(far[2 * j + 1]));
-    context.lineTo(px(near[2 * j]), py(near[2 * j + 1]));
-    context.closePath();
-  }
-  context.fill();
-}
-
-function drawGrid(context, width, height, view, px, py, tone) {
-  context.strokeStyle = colour("--grid");
-  context.lineWidth = 1;
-  context.beginPath();
-  const x0 = view.x - width / 2 / view.scale, y0 = view.y - height / 2 / view.scale;
-  for (let x = Math.ceil(x0 / 5) * 5; x < x0 + width / view.scale; x += 5) { context.moveTo(Math.round(px(x)) + 0.5, 0); context.lineTo(Math.round(px(x)) + 0.5, height); }
-  for (let y = Math.ceil(y0 / 5) * 5; y < y0 + height / view.scale; y += 5) { context.moveTo(0, Math.round(py(y)) + 0.5); context.lineTo(width, Math.round(py(y)) + 0.5); }
-  context.stroke();
-}
-
-function drawCamera(context, px, py, camera, view, tone, index, count) {
-  const x = px(camera.x), y = py(camera.y);
-  context.textAlign = "center";
-  for (const ring of RINGS_M) {
-    context.strokeStyle = ring === 25 ? tone.soft : tone.line;
-    context.setLineDash(ring === 25 ? [6, 4] : []);
-    context.beginPath();
-    context.arc(x, y, ring * view.scale, 0, 7);
-    context.stroke();
-    context.setLineDash([]);
-    if (index === 0) {
-      const up = camera.heading_deg * Math.PI / 180;
-      const rx = x + Math.cos(up) * ring * view.scale, ry = y - Math.sin(up) * ring * view.scale;
-      halo(context, `${ring} m`, rx, ry, tone.soft, tone.panel);
+  shape(context, () => {
+    for (let i = 0; i < count; i++) {
+      const j = (i + 1) % count;
+      const corners = [place(near, i), place(far, i), place(far, j), place(near, j)];
+      if (!corners[0] || !corners[3]) continue;
+      traceLine(context, corners);
+      context.closePath();
     }
+  }, { fill: colour("--seen") });
+}
+
+// A line every 5 m.
+function drawGrid({ context, width, height, view, scale, at }) {
+  const style = { stroke: colour("--grid") };
+  const west = view.x - width / 2 / scale, south = view.y - height / 2 / scale;
+  for (let x = Math.ceil(west / 5) * 5; x < west + width / scale; x += 5) {
+    const u = Math.round(at(x, 0)[0]) + 0.5;
+    line(context, [[u, 0], [u, height]], style);
   }
-  const turn = -camera.heading_deg * Math.PI / 180;
+  for (let y = Math.ceil(south / 5) * 5; y < south + height / scale; y += 5) {
+    const v = Math.round(at(0, y)[1]) + 0.5;
+    line(context, [[0, v], [width, v]], style);
+  }
+}
+
+function drawCamera({ context, at, scale, tones }, camera, index, count) {
+  const [u, v] = at(camera.x, camera.y);
+  const heading = camera.heading_deg * Math.PI / 180;
+  for (const ring of RINGS_M) {
+    const last = ring === RINGS_M[RINGS_M.length - 1];
+    circle(context, [u, v], ring * scale, { stroke: last ? tones.soft : tones.line, dash: last ? [6, 4] : [] });
+    if (index > 0) continue;
+    const label = at(camera.x + ring * Math.cos(heading), camera.y + ring * Math.sin(heading));
+    text(context, `${ring} m`, label, { fill: tones.soft, halo: tones.panel, align: "center" });
+  }
   context.save();
-  context.translate(x, y);
-  context.rotate(turn);
-  context.fillStyle = tone.ink;
-  context.beginPath();
-  context.moveTo(15, -8);
-  context.lineTo(15, 8);
-  context.lineTo(4, 0);
-  context.fill();
-  context.beginPath();
-  context.arc(0, 0, 6, 0, 7);
-  context.fill();
+  context.translate(u, v);
+  context.rotate(-heading);
+  polygon(context, [[15, -8], [15, 8], [4, 0]], { fill: tones.ink });
+  circle(context, [0, 0], 6, { fill: tones.ink });
   context.restore();
-  halo(context, count > 1 ? `camera ${index + 1}` : "camera", x, y + 17, tone.ink, tone.panel);
+  text(context, count > 1 ? `camera ${index + 1}` : "camera", [u, v + 17], { fill: tones.ink, halo: tones.panel, align: "center" });
 }
 
-function drawPath(context, px, py, agent, tone) {
-  context.strokeStyle = tone[agent.role];
-  context.globalAlpha = 0.55;
-  context.lineWidth = 1;
-  context.setLineDash([1, 4]);
-  context.beginPath();
-  agent.path.forEach(([, x, y], i) => (i ? context.lineTo(px(x), py(y)) : context.moveTo(px(x), py(y))));
-  context.stroke();
-  context.setLineDash([]);
-  context.globalAlpha = 1;
-}
-
-function drawTrail(context, px, py, agent, frame, fps, tone) {
-  context.strokeStyle = tone[agent.role];
+function drawTrail({ context, place, tones }, agent, frame, fps) {
   context.lineCap = "round";
   const first = Math.max(0, frame - TRAIL_S * fps);
   for (let f = first + 1; f <= frame; f++) {
-    const a = 2 * (f - 1), b = 2 * f;
-    if (agent.true[a] === null || agent.true[b] === null) continue;
     const part = (f - first) / (frame - first);
-    context.globalAlpha = 0.15 + 0.6 * part;
-    context.lineWidth = 1 + 2.5 * part;
-    context.beginPath();
-    context.moveTo(px(agent.true[a]), py(agent.true[a + 1]));
-    context.lineTo(px(agent.true[b]), py(agent.true[b + 1]));
-    context.stroke();
+    const ends = [place(agent.true, f - 1), place(agent.true, f)];
+    line(context, ends, { stroke: tones[agent.role], width: 1 + 2.5 * part, alpha: 0.15 + 0.6 * part });
   }
-  context.globalAlpha = 1;
   context.lineCap = "butt";
 }
 
 // The true body, to scale (but never too small to see), with its heading.
-function drawAgent(context, px, py, agent, frame, scale, tone) {
-  const x = agent.true[2 * frame], y = agent.true[2 * frame + 1];
-  if (x === null || x === undefined) return;
+function drawAgent({ context, place, scale, tones }, agent, frame) {
+  const at = place(agent.true, frame);
+  if (!at) return;
   const [length, wide] = agent.size_m.map((size) => Math.max(size * scale, 8));
+  const body = { fill: tones[agent.role], stroke: tones.panel, width: 1.5 };
+  const round = agent.role === "pedestrian";
   context.save();
-  context.translate(px(x), py(y));
+  context.translate(...at);
   context.rotate(-agent.heading[frame]);
-  context.fillStyle = tone[agent.role];
-  context.strokeStyle = tone.panel;
-  context.lineWidth = 1.5;
-  context.beginPath();
-  if (agent.role === "pedestrian") context.arc(0, 0, Math.max(wide, 11) / 2 + 1, 0, 7);
-  else context.roundRect(-length / 2, -wide / 2, length, wide, Math.min(wide / 2, 5));
-  context.fill();
-  context.stroke();
-  const tip = (agent.role === "pedestrian" ? 7 : length / 2) + 9;
-  context.beginPath();
-  context.moveTo(tip, 0);
-  context.lineTo(tip - 7, -4.5);
-  context.lineTo(tip - 7, 4.5);
-  context.fill();
+  if (round) circle(context, [0, 0], Math.max(wide, 11) / 2 + 1, body);
+  else shape(context, () => context.roundRect(-length / 2, -wide / 2, length, wide, Math.min(wide / 2, 5)), body);
+  const tip = (round ? 7 : length / 2) + 9;
+  polygon(context, [[tip, 0], [tip - 7, -4.5], [tip - 7, 4.5]], { fill: tones[agent.role] });
   context.restore();
 }
 
-// Where the camera puts somebody: a ring, tied to the true place.
-function drawDetection(context, px, py, agent, frame, tone) {
-  const x = agent.detected[2 * frame], y = agent.detected[2 * frame + 1];
-  if (x === null || x === undefined) {
-    if (agent.missed[frame] && agent.true[2 * frame] !== null) {
-      const ax = px(agent.true[2 * frame]), ay = py(agent.true[2 * frame + 1]);
-      context.strokeStyle = colour("--danger");
-      context.lineWidth = 2.5;
-      context.beginPath();
-      context.moveTo(ax - 9, ay - 9);
-      context.lineTo(ax + 9, ay + 9);
-      context.moveTo(ax + 9, ay - 9);
-      context.lineTo(ax - 9, ay + 9);
-      context.stroke();
-    }
-    return;
+// A detection: a ring, tied to the true position. A missed agent is crossed out.
+function drawDetection({ context, place, tones }, agent, frame) {
+  const truth = place(agent.true, frame), detected = place(agent.detected, frame);
+  if (detected) {
+    line(context, [truth, detected], { stroke: tones.ink });
+    circle(context, detected, 4.5, { stroke: tones.ink, width: 1.5 });
+  } else if (truth && agent.missed[frame]) {
+    const [u, v] = truth;
+    const cross = [[u - 9, v - 9], [u + 9, v + 9], null, [u + 9, v - 9], [u - 9, v + 9]];
+    line(context, cross, { stroke: colour("--danger"), width: 2.5 });
   }
-  const dx = px(x), dy = py(y);
-  context.strokeStyle = tone.ink;
-  context.lineWidth = 1;
-  if (agent.true[2 * frame] !== null) {
-    context.beginPath();
-    context.moveTo(px(agent.true[2 * frame]), py(agent.true[2 * frame + 1]));
-    context.lineTo(dx, dy);
-    context.stroke();
-  }
-  context.lineWidth = 1.5;
-  context.beginPath();
-  context.arc(dx, dy, 4.5, 0, 7);
-  context.stroke();
 }
 
 // Names of the tracks, where there is room: the whole name, its number only, or nothing.
-function drawTracks(context, px, py, tracks, tone, taken) {
-  context.textAlign = "left";
+function drawTracks({ context, at, tones }, tracks, taken) {
   const free = (box) => taken.every(([x, y, w, h]) => box[0] > x + w || box[0] + box[2] < x || box[1] > y + h || box[1] + box[3] < y);
-  for (const track of tracks) {
-    const x = px(track.x), y = py(track.y);
-    taken.push([x - 7, y - 7, 14, 14]);
-  }
-  for (const track of tracks) {
-    const x = px(track.x), y = py(track.y);
-    const tries = [`${track.kind} ${track.id}`, String(track.id)].flatMap((text) => {
-      const wide = context.measureText(text).width * 1.1;
-      return [[12, -14], [12, 14], [-12 - wide, -14], [-12 - wide, 14]].map(([dx, dy]) => ({ text, at: [x + dx, y + dy], box: [x + dx, y + dy - 7, wide, 14] }));
+  const marks = tracks.map((track) => ({ ...track, spot: at(track.x, track.y) }));
+  for (const { spot: [u, v] } of marks) taken.push([u - 7, v - 7, 14, 14]);
+  for (const { kind, id, spot: [u, v] } of marks) {
+    const tries = [`${kind} ${id}`, String(id)].flatMap((words) => {
+      const wide = context.measureText(words).width * 1.1;
+      return [[12, -14], [12, 14], [-12 - wide, -14], [-12 - wide, 14]].map(([du, dv]) => ({ words, spot: [u + du, v + dv], box: [u + du, v + dv - 7, wide, 14] }));
     });
     const found = tries.find(({ box }) => free(box));
     if (!found) continue;
     taken.push(found.box);
-    halo(context, found.text, ...found.at, tone[track.kind], tone.panel, true);
+    text(context, found.words, found.spot, { fill: tones[kind], halo: tones.panel, bold: true });
   }
 }
 
-// Every pair by a thin line, the one that decides by a strong one; returns its distance's place.
-function drawPairs(context, px, py, play, side, frame, tracks, tone) {
-  const places = new Map(tracks.map((track) => [track.id, track]));
-  const chosen = chosenPair(play, side, frame);
-  const line = (pair) => {
-    const a = places.get(pair.cyclist), b = places.get(pair.pedestrian);
-    if (!a || !b) return null;
-    context.beginPath();
-    context.moveTo(px(a.x), py(a.y));
-    context.lineTo(px(b.x), py(b.y));
-    context.stroke();
-    return [px((a.x + b.x) / 2), py((a.y + b.y) / 2)];
-  };
+// Every pair by a thin line, the one that decides by a strong one; returns its distance's label.
+function drawPairs({ context, at, tones }, play, side, frame, tracks) {
+  const places = new Map(tracks.map((track) => [track.id, at(track.x, track.y)]));
+  const endsOf = (pair) => [places.get(pair.cyclist), places.get(pair.pedestrian)];
   for (const pair of pairsAt(play, side, frame)) {
-    context.strokeStyle = pair.passes.fires ? colour("--alert") : tone.soft;
-    context.lineWidth = pair.passes.fires ? 1.5 : 1;
-    context.setLineDash(pair.passes.fires ? [] : [2, 4]);
-    line(pair);
+    line(context, endsOf(pair), pair.passes.fires ? { stroke: colour("--alert"), width: 1.5 } : { stroke: tones.soft, dash: [2, 4] });
   }
-  context.setLineDash([]);
-  if (!chosen) return null;
-  const state = stateAt(side, frame);
-  context.strokeStyle = tone.panel;
-  context.lineWidth = 7;
-  line(chosen);
-  context.strokeStyle = colour(`--${state.toLowerCase()}`);
-  context.lineWidth = state === "ALERT" ? 4 : 3;
-  const middle = line(chosen);
-  const name = state.toLowerCase();
-  return middle && { text: `${chosen.distance.toFixed(1)} m`, x: middle[0], y: middle[1], fill: colour(`--${name}`), ink: colour(`--on-${name}`) };
+  const chosen = chosenPair(play, side, frame);
+  const ends = chosen ? endsOf(chosen) : [];
+  if (!ends[0] || !ends[1]) return null;
+  const state = stateAt(side, frame).toLowerCase();
+  const colours = { fill: colour(`--${state}`), ink: colour(`--on-${state}`) };
+  line(context, ends, { stroke: tones.panel, width: 7 });
+  line(context, ends, { stroke: colours.fill, width: state === "alert" ? 4 : 3 });
+  const middle = [0, 1].map((axis) => (ends[0][axis] + ends[1][axis]) / 2);
+  return { text: `${chosen.distance.toFixed(1)} m`, at: middle, colours };
 }
 
-function drawScale(context, width, height, scale, tone) {
-  const long = 5 * scale;
-  context.strokeStyle = tone.ink;
-  context.lineWidth = 1.5;
-  context.beginPath();
-  context.moveTo(12, height - 16);
-  context.lineTo(12, height - 11);
-  context.lineTo(12 + long, height - 11);
-  context.lineTo(12 + long, height - 16);
-  context.stroke();
-  context.textAlign = "left";
-  halo(context, "5 m", 17, height - 21, tone.ink, tone.panel);
-  context.textAlign = "center";
-  halo(context, "N", width - 16, 26, tone.ink, tone.panel);
-  context.fillStyle = tone.ink;
-  context.beginPath();
-  context.moveTo(width - 16, 5);
-  context.lineTo(width - 11, 17);
-  context.lineTo(width - 21, 17);
-  context.fill();
+// A bar of 5 m, and north.
+function drawScale({ context, width, height, scale, tones }) {
+  const right = 12 + 5 * scale, low = height - 11;
+  line(context, [[12, low - 5], [12, low], [right, low], [right, low - 5]], { stroke: tones.ink, width: 1.5 });
+  text(context, "5 m", [17, height - 21], { fill: tones.ink, halo: tones.panel });
+  text(context, "N", [width - 16, 26], { fill: tones.ink, halo: tones.panel, align: "center" });
+  polygon(context, [[width - 16, 5], [width - 11, 17], [width - 21, 17]], { fill: tones.ink });
 }
 
-function drawHandles(context, px, py, handles, tone) {
-  context.textAlign = "left";
-  const told = [];
+function drawHandles({ context, at, tones }, handles) {
+  const labelled = [];
   for (const handle of handles) {
-    const x = px(handle.x), y = py(handle.y);
-    context.fillStyle = handle.chosen ? tone.ink : tone.panel;
-    context.strokeStyle = tone[handle.role];
-    context.lineWidth = 2.5;
-    context.beginPath();
-    context.rect(x - 6, y - 6, 12, 12);
-    context.fill();
-    context.stroke();
-    if (!handle.chosen && told.some(([a, b]) => Math.abs(a - x) < 44 && Math.abs(b - y) < 16)) continue;
-    told.push([x, y]);
-    halo(context, `${handle.t.toFixed(1)} s`, x + 10, y + 11, tone.ink, tone.panel);
+    const [u, v] = at(handle.x, handle.y);
+    shape(context, () => context.rect(u - 6, v - 6, 12, 12), { fill: handle.chosen ? tones.ink : tones.panel, stroke: tones[handle.role], width: 2.5 });
+    if (!handle.chosen && labelled.some(([a, b]) => Math.abs(a - u) < 44 && Math.abs(b - v) < 16)) continue;
+    labelled.push([u, v]);
+    text(context, `${handle.t.toFixed(1)} s`, [u + 10, v + 11], { fill: tones.ink, halo: tones.panel });
   }
 }
 
-function halo(context, text, x, y, ink, paper, strong = false) {
-  context.save();
-  if (strong) context.font = `600 ${context.font}`;
-  context.strokeStyle = paper;
-  context.lineWidth = 4;
-  context.lineJoin = "round";
-  context.strokeText(text, x, y);
-  context.fillStyle = ink;
-  context.fillText(text, x, y);
-  context.restore();
-}
-
-function chip(context, text, x, y, fill, ink) {
-  context.save();
-  context.font = `600 ${context.font}`;
-  const half = context.measureText(text).width / 2 + 6;
-  context.fillStyle = fill;
-  context.beginPath();
-  context.roundRect(x - half, y - 10, 2 * half, 20, 10);
-  context.fill();
-  context.fillStyle = ink;
-  context.fillText(text, x, y + 0.5);
-  context.restore();
-}
-
-// What a screen reader is told of the picture.
+// The plan as a text for screen readers.
 export function planWords(play, frame) {
   const side = play.sides[0];
   const words = play.agents.filter((agent) => agent.true[2 * frame] !== null).map((agent) =>

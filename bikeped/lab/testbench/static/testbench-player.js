@@ -31,7 +31,7 @@ export function player(options) {
     const lamp = $("#lamp");
     if (lamp.dataset.state !== state || !lamp.firstChild) {
       lamp.dataset.state = state;
-      lamp.replaceChildren(stateIcon(state), el("b", {}, STATES[state].word));
+      lamp.replaceChildren(stateIcon(state), el("b", {}, STATES[state]));
     }
     setText($("#headline"), headline(play, side, frame));
     setText($("#sentence"), side.sentence[frame]);
@@ -154,6 +154,6 @@ function changesTable(host, play) {
     el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Time"), play.sides.map((side) => el("th", { scope: "col" }, configurationName(side.name))), el("th", { scope: "col" }, "Danger (truth)"), el("th", { scope: "col", class: "number" }, "Pair, m"), el("th", { scope: "col" }, "The rule’s words"))),
     el("tbody", {}, frames.map((f) => {
       const pair = chosenPair(play, play.sides[0], f);
-      return el("tr", {}, el("th", { scope: "row" }, `${(f / play.fps).toFixed(2)} s`), play.sides.map((side) => el("td", {}, STATES[NAMES[side.state[f]]].word)), el("td", {}, { none: "–", actionable: "yes, a warning helps", imminent: "yes, too late" }[TIERS[play.truth.tier[f]]]), el("td", { class: "number" }, pair ? pair.distance.toFixed(2) : "–"), el("td", {}, play.sides[0].sentence[f]));
+      return el("tr", {}, el("th", { scope: "row" }, `${(f / play.fps).toFixed(2)} s`), play.sides.map((side) => el("td", {}, STATES[NAMES[side.state[f]]])), el("td", {}, { none: "–", actionable: "yes, a warning helps", imminent: "yes, too late" }[TIERS[play.truth.tier[f]]]), el("td", { class: "number" }, pair ? pair.distance.toFixed(2) : "–"), el("td", {}, play.sides[0].sentence[f]));
     })));
 }

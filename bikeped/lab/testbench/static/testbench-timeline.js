@@ -1,18 +1,19 @@
-// The time line: for each decision a band of states, the truth's danger, the distance, marks.
+// The time line: for each decision a band of states, then the ground truth and the distance.
 
+import { chip, line, polygon, text } from "/static/canvas.js";
 import { canvasOf, colour } from "/static/ui.js";
 import { NAMES, configurationName } from "/static/testbench-words.js";
 
-const LEFT = 104, RIGHT = 14, TOP = 18, BAND = 34, GAP = 20, TRUTH = 24, CURVE = 62, AXIS = 22;
+const LEFT = 104, LEFT_SMALL = 58, SMALL_PX = 600, RIGHT = 14, TOP = 18, BAND = 34, GAP = 20, TRUTH = 24, CURVE = 62, AXIS = 22;
 
-// `where()` gives {play, frame}; `seek(frame)` is called while somebody drags.
+// `where()` gives {play, frame}; `seek(frame)` is called while the pointer drags.
 export function timeline(canvas, where, seek) {
   const paint = canvasOf(canvas, (context, width, height) => draw(context, width, height, where()));
   const host = canvas.parentElement;
   const toFrame = (event) => {
     const { play } = where();
     const box = canvas.getBoundingClientRect();
-    const left = box.width < 600 ? 58 : LEFT;
+    const left = box.width < SMALL_PX ? LEFT_SMALL : LEFT;
     const part = (event.clientX - box.left - left) / (box.width - left - RIGHT);
     return Math.round(Math.min(Math.max(part, 0), 1) * (play.frames - 1));
   };
@@ -34,107 +35,83 @@ export function timeline(canvas, where, seek) {
   };
 }
 
-export const heightFor = (sides) => TOP + sides * (BAND + GAP) + TRUTH + 8 + CURVE + AXIS;
+const heightFor = (sides) => TOP + sides * (BAND + GAP) + TRUTH + 8 + CURVE + AXIS;
 
 function draw(context, width, height, { play, frame }) {
   if (!play) return;
-  const small = width < 600;
-  const left = small ? 58 : LEFT;
-  const ink = colour("--ink"), soft = colour("--soft"), line = colour("--line"), panel = colour("--panel");
+  const small = width < SMALL_PX;
+  const left = small ? LEFT_SMALL : LEFT;
+  const [ink, soft, grey, panel] = ["--ink", "--soft", "--line", "--panel"].map(colour);
   const span = play.frames - 1;
   const x = (f) => left + (f / span) * (width - left - RIGHT);
   context.font = `12px ${colour("--sans")}`;
   context.textBaseline = "middle";
-  const label = (text, y) => {
-    context.fillStyle = soft;
-    context.textAlign = "left";
-    for (const [i, part] of (small ? [text.split(" ").pop()] : wrap(text, 15)).entries()) context.fillText(part, 0, y + i * 14);
+  const label = (words, y) => {
+    const parts = small ? [words.split(" ").pop()] : wrap(words, 15);
+    parts.forEach((part, i) => text(context, part, [0, y + i * 14], { fill: soft }));
   };
 
   // whole seconds
   const bottom = height - AXIS;
   const seconds = span / play.fps;
   const every = seconds > 40 ? 5 : seconds > 20 || small ? 2 : 1;
-  context.strokeStyle = line;
-  context.lineWidth = 1;
   for (let s = 0; s <= seconds; s += every) {
     const at = Math.round(x(s * play.fps)) + 0.5;
-    context.beginPath();
-    context.moveTo(at, TOP);
-    context.lineTo(at, bottom);
-    context.stroke();
-    context.fillStyle = soft;
-    context.textAlign = "center";
-    context.fillText(`${s}${s === 0 ? " s" : ""}`, at, bottom + 12);
+    line(context, [[at, TOP], [at, bottom]], { stroke: grey });
+    text(context, `${s}${s === 0 ? " s" : ""}`, [at, bottom + 12], { fill: soft, align: "center" });
   }
 
   let y = TOP;
   for (const side of play.sides) {
-    label(configurationName(side.name, true), y + BAND / 2 - (configurationName(side.name, true).length > 15 && !small ? 7 : 0));
+    const name = configurationName(side.name, true);
+    label(name, y + BAND / 2 - (name.length > 15 && !small ? 7 : 0));
     drawStates(context, x, y, side, small);
     drawOnsets(context, x, y, side, play, ink);
     y += BAND + GAP;
   }
 
   label("danger (truth)", y + TRUTH / 2);
-  drawTruth(context, x, y, play, line);
+  drawTruth(context, x, y, play, grey);
   y += TRUTH + 8;
   label("distance, m", y + 8);
-  drawDistance(context, x, y, play, { ink, soft, line, left, right: width - RIGHT });
+  drawDistance(context, x, y, play, { ink, soft, grey, left, right: width - RIGHT });
 
   // closest approach: a diamond with its line
   if (play.closest_s !== null) {
     const at = x(play.closest_s * play.fps);
-    context.strokeStyle = ink;
-    context.setLineDash([2, 3]);
-    context.beginPath();
-    context.moveTo(at, TOP - 4);
-    context.lineTo(at, bottom);
-    context.stroke();
-    context.setLineDash([]);
-    context.fillStyle = ink;
-    context.beginPath();
-    context.moveTo(at, TOP - 14);
-    context.lineTo(at + 5, TOP - 8);
-    context.lineTo(at, TOP - 2);
-    context.lineTo(at - 5, TOP - 8);
-    context.fill();
-    context.textAlign = at > width - 130 ? "right" : "left";
-    context.fillText("closest approach", at + (at > width - 130 ? -9 : 9), TOP - 8);
+    const side = at > width - 130 ? -9 : 9;
+    line(context, [[at, TOP - 4], [at, bottom]], { stroke: ink, width: 1.5, dash: [2, 3] });
+    polygon(context, [[at, TOP - 14], [at + 5, TOP - 8], [at, TOP - 2], [at - 5, TOP - 8]], { fill: ink });
+    text(context, "closest approach", [at + side, TOP - 8], { fill: ink, align: side < 0 ? "right" : "left" });
   }
 
-  // the moment
-  const now = x(frame);
-  context.strokeStyle = panel;
-  context.lineWidth = 5;
-  stroke(context, now, TOP - 2, now, bottom + 2);
-  context.strokeStyle = ink;
-  context.lineWidth = 2;
-  stroke(context, now, TOP - 2, now, bottom + 2);
-  const text = `${(frame / play.fps).toFixed(2)} s`;
-  const half = context.measureText(text).width / 2 + 6;
-  const middle = Math.min(Math.max(now, left - 10 + half), width - half);
-  context.fillStyle = ink;
-  context.beginPath();
-  context.roundRect(middle - half, bottom + 3, 2 * half, 18, 4);
-  context.fill();
-  context.fillStyle = panel;
-  context.textAlign = "center";
-  context.fillText(text, middle, bottom + 12.5);
+  // the frame shown
+  const cursor = [[x(frame), TOP - 2], [x(frame), bottom + 2]];
+  line(context, cursor, { stroke: panel, width: 5 });
+  line(context, cursor, { stroke: ink, width: 2 });
+  const time = `${(frame / play.fps).toFixed(2)} s`;
+  const half = context.measureText(time).width / 2 + 6;
+  const middle = Math.min(Math.max(x(frame), left - 10 + half), width - half);
+  chip(context, time, [middle, bottom + 12], { fill: ink, ink: panel, height: 18, radius: 4 });
+}
+
+// Runs of equal codes as [code, start, width] in pixels, each half a frame longer on both sides.
+function segments(codes, x) {
+  return spans(codes).map(({ from, to, code }) => {
+    const start = x(Math.max(from - 0.5, 0));
+    return [code, start, Math.max(x(Math.min(to + 0.5, codes.length - 1)) - start, 1)];
+  });
 }
 
 // States as steps: the higher, the more urgent. Readable without colour.
 function drawStates(context, x, y, side, small) {
-  for (const { from, to, code } of spans(side.state)) {
+  for (const [code, start, wide] of segments(side.state, x)) {
     const name = NAMES[code];
     const tall = BAND * [0.3, 0.5, 0.75, 1][code];
-    const a = x(Math.max(from - 0.5, 0)), b = x(Math.min(to + 0.5, side.state.length - 1));
     context.fillStyle = colour(`--${name.toLowerCase()}`);
-    context.fillRect(a, y + BAND - tall, Math.max(b - a, 1), tall);
-    if (tall > 14 && b - a > (small ? 60 : 66)) {
-      context.fillStyle = colour(`--on-${name.toLowerCase()}`);
-      context.textAlign = "left";
-      context.fillText(name, a + 7, y + BAND - tall / 2 + 0.5);
+    context.fillRect(start, y + BAND - tall, wide, tall);
+    if (tall > 14 && wide > (small ? 60 : 66)) {
+      text(context, name, [start + 7, y + BAND - tall / 2 + 0.5], { fill: colour(`--on-${name.toLowerCase()}`) });
     }
   }
 }
@@ -144,104 +121,64 @@ function drawOnsets(context, x, y, side, play, ink) {
   let free = -Infinity;
   for (const onset of side.onsets) {
     const at = x(onset.frame);
-    context.fillStyle = ink;
-    context.beginPath();
-    context.moveTo(at, y + 3);
-    context.lineTo(at - 5, y - 6);
-    context.lineTo(at + 5, y - 6);
-    context.fill();
-    if (onset.budget_s === null) continue;
-    const end = x(onset.frame + onset.budget_s * play.fps);
+    polygon(context, [[at, y + 3], [at - 5, y - 6], [at + 5, y - 6]], { fill: ink });
+    if (onset.budget_s === null || at < free) continue;
+    const end = Math.max(x(onset.frame + onset.budget_s * play.fps), at);
     const enough = onset.budget_s > play.prt_s.distracted;
     const tone = enough ? ink : colour("--danger");
     const low = y + BAND + 6;
-    if (at < free) continue;
-    context.strokeStyle = tone;
-    context.lineWidth = 1.5;
-    context.beginPath();
-    context.moveTo(at, low - 3);
-    context.lineTo(at, low);
-    context.lineTo(Math.max(end, at), low);
-    context.lineTo(Math.max(end, at), low - 3);
-    context.stroke();
-    const text = `${enough ? "✓" : "✕"} ${onset.budget_s.toFixed(2)} s to react`;
-    const wide = context.measureText(text).width;
-    context.fillStyle = tone;
-    context.textAlign = "left";
-    const box = Math.min(at + 2, x(play.frames - 1) - wide);
-    context.fillStyle = colour("--panel");
-    context.fillRect(box - 1, low + 1, wide + 2, 10);
-    context.fillStyle = tone;
+    line(context, [[at, low - 3], [at, low], [end, low], [end, low - 3]], { stroke: tone, width: 1.5 });
+    const words = `${enough ? "✓" : "✕"} ${onset.budget_s.toFixed(2)} s to react`;
+    const wide = context.measureText(words).width;
+    const start = Math.min(at + 2, x(play.frames - 1) - wide);
+    context.save();
     context.font = `11px ${colour("--sans")}`;
-    context.fillText(text, box, low + 6);
-    context.font = `12px ${colour("--sans")}`;
-    free = Math.max(end, box + wide) + 8;
+    context.fillStyle = colour("--panel");
+    context.fillRect(start - 1, low + 1, wide + 2, 10);
+    text(context, words, [start, low + 6], { fill: tone });
+    context.restore();
+    free = Math.max(end, start + wide) + 8;
   }
 }
 
-function drawTruth(context, x, y, play, line) {
-  context.strokeStyle = line;
-  stroke(context, x(0), y + TRUTH - 0.5, x(play.frames - 1), y + TRUTH - 0.5);
-  for (const { from, to, code } of spans(play.truth.tier)) {
+function drawTruth(context, x, y, play, grey) {
+  line(context, [[x(0), y + TRUTH - 0.5], [x(play.frames - 1), y + TRUTH - 0.5]], { stroke: grey });
+  for (const [code, start, wide] of segments(play.truth.tier, x)) {
     if (!code) continue;
-    const a = x(Math.max(from - 0.5, 0)), b = x(Math.min(to + 0.5, play.frames - 1));
-    context.fillStyle = colour(code === 1 ? "--actionable" : "--imminent");
-    context.fillRect(a, y, Math.max(b - a, 1), TRUTH);
-    if (code === 2) hatch(context, a, y, Math.max(b - a, 1), TRUTH);
-    const text = code === 1 ? "a warning helps" : "too late";
-    if (b - a > context.measureText(text).width + 12) {
-      context.fillStyle = colour("--on-danger");
-      context.textAlign = "left";
-      if (code === 2) {
-        context.fillStyle = colour("--imminent");
-        context.fillRect(a + 3, y + 3, context.measureText(text).width + 8, TRUTH - 6);
-        context.fillStyle = colour("--on-danger");
-      }
-      context.fillText(text, a + 6, y + TRUTH / 2 + 0.5);
-    }
+    const late = code === 2;
+    const words = late ? "too late" : "a warning helps";
+    const needed = context.measureText(words).width;
+    context.fillStyle = colour(late ? "--imminent" : "--actionable");
+    context.fillRect(start, y, wide, TRUTH);
+    if (late) hatch(context, start, y, wide, TRUTH);
+    if (wide <= needed + 12) continue;
+    if (late) context.fillRect(start + 3, y + 3, needed + 8, TRUTH - 6);
+    text(context, words, [start + 6, y + TRUTH / 2 + 0.5], { fill: colour("--on-danger") });
   }
 }
 
-function drawDistance(context, x, y, play, { ink, soft, line, left, right }) {
+function drawDistance(context, x, y, play, { ink, soft, grey, left, right }) {
   const values = play.truth.nearest_m;
   const most = Math.min(25, Math.max(10, 5 * Math.ceil(Math.max(...values.filter((v) => v !== null), 0) / 5)));
   const high = CURVE - 6;
   const to = (value) => y + high - Math.min(value, most) / most * high;
-  const decision = play.sides[0].decision;
-  context.fillStyle = colour("--band");
-  context.fillRect(left, to(decision.d_max_m), right - left, Math.max(to(decision.d_min_m) - to(decision.d_max_m), 0));
-  context.fillStyle = soft;
-  context.textAlign = "right";
-  for (const value of most > 15 ? [0, 10, 20] : [0, 5, 10]) {
-    context.fillText(String(value), left - 6, to(value));
-    context.strokeStyle = line;
-    stroke(context, left, Math.round(to(value)) + 0.5, right, Math.round(to(value)) + 0.5);
-  }
-  const curve = (list, style, wide, dash) => {
-    context.strokeStyle = style;
-    context.lineWidth = wide;
-    context.setLineDash(dash);
-    context.beginPath();
-    let open = false;
-    list.forEach((value, f) => {
-      if (value === null || value > most) { open = false; return; }
-      if (open) context.lineTo(x(f), to(value));
-      else context.moveTo(x(f), to(value));
-      open = true;
-    });
-    context.stroke();
-    context.setLineDash([]);
-  };
-  curve(measured(play), colour("--accent"), 1.5, []);
-  curve(values, ink, 1.5, [5, 3]);
-}
-
-// The distance that the rule saw of the pair it decided about.
-function measured(play) {
   const side = play.sides[0];
-  return side.chosen.map((at) => (at < 0 ? null : side.pairs.distance_m[at]));
+  const band = [side.decision.d_max_m, side.decision.d_min_m].map(to);
+  context.fillStyle = colour("--band");
+  context.fillRect(left, band[0], right - left, Math.max(band[1] - band[0], 0));
+  for (const value of most > 15 ? [0, 10, 20] : [0, 5, 10]) {
+    const level = Math.round(to(value)) + 0.5;
+    text(context, String(value), [left - 6, to(value)], { fill: soft, align: "right" });
+    line(context, [[left, level], [right, level]], { stroke: grey });
+  }
+  const points = (list) => list.map((value, f) => (value === null || value > most ? null : [x(f), to(value)]));
+  // the distance that the rule measured of its pair, and the true one
+  const measured = side.chosen.map((at) => (at < 0 ? null : side.pairs.distance_m[at]));
+  line(context, points(measured), { stroke: colour("--accent"), width: 1.5 });
+  line(context, points(values), { stroke: ink, width: 1.5, dash: [5, 3] });
 }
 
+// Runs of equal codes: {from, to, code}, both ends within.
 export function spans(codes) {
   const found = [];
   for (let i = 0; i < codes.length; i++) {
@@ -253,18 +190,13 @@ export function spans(codes) {
 }
 
 function hatch(context, x, y, width, height) {
+  const lines = [];
+  for (let at = x - height; at < x + width; at += 7) lines.push([at, y + height], [at + height, y], null);
   context.save();
   context.beginPath();
   context.rect(x, y, width, height);
   context.clip();
-  context.strokeStyle = colour("--panel");
-  context.lineWidth = 1.5;
-  context.beginPath();
-  for (let at = x - height; at < x + width; at += 7) {
-    context.moveTo(at, y + height);
-    context.lineTo(at + height, y);
-  }
-  context.stroke();
+  line(context, lines, { stroke: colour("--panel"), width: 1.5 });
   context.restore();
 }
 
@@ -276,11 +208,4 @@ function wrap(text, most) {
     else lines[lines.length - 1] = last ? `${last} ${word}` : word;
   }
   return lines;
-}
-
-function stroke(context, x1, y1, x2, y2) {
-  context.beginPath();
-  context.moveTo(x1, y1);
-  context.lineTo(x2, y2);
-  context.stroke();
 }

@@ -4,7 +4,7 @@
 import { metres, seconds } from "/static/ui.js";
 
 export const NAMES = ["IDLE", "SAFE", "WARNING", "ALERT"];
-export const LIGHT = { IDLE: "blue", SAFE: "green", WARNING: "yellow", ALERT: "red" };
+const LIGHT = { IDLE: "blue", SAFE: "green", WARNING: "yellow", ALERT: "red" };
 export const TIERS = ["none", "actionable", "imminent"];
 
 // Names of configurations as people read them.
@@ -22,7 +22,7 @@ export function configurationName(name, short = false) {
 export const stateAt = (side, frame) => NAMES[side.state[frame]];
 
 // A pair of a frame by its place in the side's lists, with the tests it passes by name.
-export function pairAt(play, side, at) {
+function pairAt(play, side, at) {
   if (at < 0 || at === undefined) return null;
   const pairs = side.pairs;
   const passes = Object.fromEntries(play.tests.map((test, bit) => [test, (pairs.passes[at] >> bit & 1) === 1]));

@@ -1,6 +1,6 @@
 // The test bench: asks the box for runs of the deployed rule and shows them. It computes no verdict.
 
-import { $, announce, el, request, setText, toast } from "/static/ui.js";
+import { $, announce, download, el, request, setText, toast } from "/static/ui.js";
 import { controls, set } from "/static/testbench-controls.js";
 import { editor } from "/static/testbench-editor.js";
 import { flow } from "/static/testbench-flow.js";
@@ -170,18 +170,12 @@ const equal = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
 // --- files and links
 
-function save(text, name, type) {
-  const link = el("a", { href: URL.createObjectURL(new Blob([text], { type })), download: name });
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-}
-
 const plainName = (text) => text.toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-|-$/g, "") || "scenario";
 
 async function saveScenario() {
   try {
     const { text, script } = await request("/testbench/read-scenario", { json: { text: JSON.stringify(app.play.script), name: "scenario" } });
-    save(text, `${plainName(script.name)}.yaml`, "text/yaml");
+    download(text, `${plainName(script.name)}.yaml`, "text/yaml");
   } catch (error) { toast(error.message, "bad"); }
 }
 
@@ -243,7 +237,7 @@ async function start() {
   });
   show = player({ diagram, handles: () => (app.editing ? edits.handles() : null), editing: () => app.editing, plan: (canvas, where) => plan(canvas, where, edits.drag) });
   knobs = controls($("#knobs"), app.about, (key, value) => change(set(app.bench, key, value), {}));
-  suite = suitePanel($("#suite"), { open: (name) => { choose(name); scrollTo({ top: 0 }); }, save: () => save(app.suite.file, "challenge.json", "application/json"), link: copyLink, load: loadChallenge });
+  suite = suitePanel($("#suite"), { open: (name) => { choose(name); scrollTo({ top: 0 }); }, save: () => download(app.suite.file, "challenge.json", "application/json"), link: copyLink, load: loadChallenge });
   $("#scenario").addEventListener("change", (event) => choose(event.target.value));
   $("#configuration").addEventListener("change", (event) => { const decision = app.about.configurations[event.target.value]; if (decision) change({ ...app.bench, decision }); });
   for (const id of ["beside-1", "beside-2"]) {
