@@ -1,4 +1,4 @@
-"""What the tests of the pages share: accesses, a small service's inside, outcomes to show."""
+"""What the tests of the pages share: accesses, a small service's web_context, results to show."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from prometheus_client import CollectorRegistry
 from bikeped.config import LoadedConfig, parse_config
 from bikeped.faults import Fault
 from bikeped.pipeline.detection_stage import Picture
-from bikeped.pipeline.loop import Outcome
-from bikeped.pipeline.track_and_decide import Judge
-from bikeped.pipeline.web_context import Inside
+from bikeped.pipeline.loop import FrameResult
+from bikeped.pipeline.track_and_decide import TrackAndDecide
+from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.builders import ComponentStatus, Counters, HealthMessage, health_message
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.types import Colour, Detections, Frame, Kind, Signal
@@ -49,12 +49,12 @@ def small(*overrides: str) -> LoadedConfig:
     return parse_config(CONFIG, "small.yaml", Path(), overrides)
 
 
-def inside(loaded: LoadedConfig | None = None, mqtt: MqttStatus | None = None) -> Inside:
+def web_context(loaded: LoadedConfig | None = None, mqtt: MqttStatus | None = None) -> WebContext:
     """A service's inside without a service."""
     loaded = loaded or small()
-    return Inside(
+    return WebContext(
         loaded=loaded,
-        judge=Judge(loaded),
+        track_and_decide=TrackAndDecide(loaded),
         source="drawn.avi",
         detector="drawn",
         health=health,
@@ -100,13 +100,13 @@ def picture(grey: int = 90, width: int = 960, height: int = 640) -> bytes:
 
 
 class Scene:
-    """Outcomes of a pedestrian who stands and a cyclist who comes nearer, a frame at a time."""
+    """Results of a pedestrian who stands and a cyclist who comes nearer, a frame at a time."""
 
-    def __init__(self, judge: Judge) -> None:
-        self.judge = judge
+    def __init__(self, track_and_decide: TrackAndDecide) -> None:
+        self.track_and_decide = track_and_decide
         self.number = 0
 
-    def next(self, signal: str = "SAFE", grey: int | None = None) -> Outcome:
+    def next(self, signal: str = "SAFE", grey: int | None = None) -> FrameResult:
         n = self.number
         self.number += 1
         detections = Detections(
@@ -118,7 +118,7 @@ class Scene:
         frame = Frame(
             n, captured_s, 960, 640, jpeg=picture(60 + 7 * n % 120 if grey is None else grey)
         )
-        judgement = self.judge.judge(detections, 960, 640, captured_s, 0.0)
+        tracking = self.track_and_decide.update(detections, 960, 640, captured_s, 0.0)
         latency = {"acquire": 1.0, "inference": 9.0 + n % 3, "total": 12.0, "capture_age": 13.0}
         seen = Picture(frame, np.zeros((1, 1, 3), np.uint8), 0.0, 1.0, 1.0)
-        return Outcome(seen, n / 30, detections, judgement, SIGNALS[signal], latency)
+        return FrameResult(seen, n / 30, detections, tracking, SIGNALS[signal], latency)

@@ -43,11 +43,11 @@ def tracker_settings(
     tracking: TrackingConfig,
     nominal_fps: float = 30.0,
     acceleration: bool = False,
-    riders_whole: bool = False,
+    cyclist_box_includes_rider: bool = False,
 ) -> TrackerSettings:
     """The tracker's parameters; `acceleration` for second-order prediction.
 
-    `riders_whole`: as `TrackerSettings` has it.
+    `cyclist_box_includes_rider`: as `TrackerSettings` has it.
     """
     return TrackerSettings(
         match_radius_m=tracking.match_radius_m,
@@ -66,7 +66,7 @@ def tracker_settings(
         acceleration=acceleration,
         max_range_m=tracking.max_range_m,
         rider_radius_m=tracking.rider_radius_m,
-        riders_whole=riders_whole,
+        cyclist_box_includes_rider=cyclist_box_includes_rider,
     )
 
 

@@ -37,7 +37,7 @@ class Detector(Protocol):
         ...
 
     @property
-    def riders_whole(self) -> bool:
+    def cyclist_box_includes_rider(self) -> bool:
         """Whether a cyclist's box holds the rider, too, who is then no pedestrian beside it."""
         ...
 

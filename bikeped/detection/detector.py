@@ -137,7 +137,7 @@ class NetworkDetector:
         return self._size
 
     @property
-    def riders_whole(self) -> bool:
+    def cyclist_box_includes_rider(self) -> bool:
         """Whether a cyclist's box holds the rider, too, by the names of the model's classes."""
         return self._whole
 

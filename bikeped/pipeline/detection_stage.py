@@ -11,15 +11,15 @@ from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.base import Detector, DetectorAnswer
 from bikeped.types import Frame, ImageArray
 
-#: A recording is looked at by so many at once, where the processor does it: see `load_eye`.
-MOST_LOOKS = 2
+#: Inferences at once on a recording, where the processor does them: see `load_detector_pool`.
+MAX_INFLIGHT = 2
 #: Pictures in use at once: being decoded, waiting, judged, being drawn, one more, and looked at.
-PICTURES = 5 + MOST_LOOKS
+FRAME_BUFFERS = 5 + MAX_INFLIGHT
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded frame; `rgb` may be a scaled copy and is valid for the next `PICTURES` - 1."""
+    """A decoded frame; `rgb` may be a scaled copy and is valid for the next `FRAME_BUFFERS` - 1."""
 
     frame: Frame
     rgb: ImageArray
@@ -28,29 +28,29 @@ class Picture:
     decode_ms: float
 
 
-class Eye(Protocol):
+class FrameDetector(Protocol):
     """What looks at pictures: a model, or the demo's reader of drawn boxes."""
 
     name: str
     model_hash: str | None
-    riders_whole: bool  #: whether a cyclist's box holds the rider, too
+    cyclist_box_includes_rider: bool  #: whether a cyclist's box holds the rider, too
 
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         """Least picture size that it needs of a frame of this size."""
 
-    def see(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectorAnswer:
         """What is in the picture; raises DetectorError. Called in worker threads, as many as looks
         are allowed at once (see `Loop`)."""
 
 
-class ModelEye:
+class DetectorPool:
     """A detector model, in as many copies as pictures are looked at once."""
 
     def __init__(self, *detectors: Detector) -> None:
         first = detectors[0]
         self.name = first.name
         self.model_hash: str | None = first.model_hash
-        self.riders_whole = first.riders_whole
+        self.cyclist_box_includes_rider = first.cyclist_box_includes_rider
         self.at_once = len(detectors)
         self._decode_size = first.decode_size
         self._free: queue.SimpleQueue[Detector] = queue.SimpleQueue()
@@ -60,7 +60,7 @@ class ModelEye:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return self._decode_size(width, height)
 
-    def see(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectorAnswer:
         detector = self._free.get()
         try:
             return detector.infer(picture.rgb, picture.frame.width, picture.frame.height)
@@ -68,16 +68,16 @@ class ModelEye:
             self._free.put(detector)
 
 
-class Vision:
-    """An eye, and the decoding at the smallest scale that it (and a picture for people) needs.
+class DetectionStage:
+    """An detector, and the decoding at the smallest scale that it (and a picture for people) needs.
 
-    `decode` belongs to one thread and `see` to others, one if its eye does not say more.
+    `decode` belongs to one thread and `see` to others, one if its detector does not say more.
     """
 
-    def __init__(self, eye: Eye, view_width: int = 0) -> None:
-        self.eye = eye
+    def __init__(self, detector: FrameDetector, view_width: int = 0) -> None:
+        self.detector = detector
         self._view_width = view_width
-        self._jpeg = JpegDecoder(buffers=PICTURES)
+        self._jpeg = JpegDecoder(buffers=FRAME_BUFFERS)
 
     def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> Picture:
         """The picture of a frame; raises CaptureError when it does not decode."""
@@ -86,13 +86,13 @@ class Vision:
             rgb = frame.rgb
         else:
             assert frame.jpeg is not None  # noqa: S101  Frame holds one of the two
-            width, height = self.eye.decode_size(frame.width, frame.height)
+            width, height = self.detector.decode_size(frame.width, frame.height)
             view = min(self._view_width, frame.width)
             if view > width:
                 width, height = view, max(height, round(frame.height * view / frame.width))
             rgb = self._jpeg.decode(frame.jpeg, min_width=width, min_height=height)
         return Picture(frame, rgb, received_s, acquire_ms, (time.perf_counter() - began) * 1e3)
 
-    def see(self, picture: Picture) -> DetectorAnswer:
-        """What the eye finds in the picture; raises DetectorError."""
-        return self.eye.see(picture)
+    def detect(self, picture: Picture) -> DetectorAnswer:
+        """What the detector finds in the picture; raises DetectorError."""
+        return self.detector.detect(picture)

@@ -33,8 +33,8 @@ from bikeped.feedback.light import LAMP_COLOURS
 from bikeped.feedback.sounds import make_wav
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.detection_stage import Picture
-from bikeped.pipeline.factory import load_eye
-from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.factory import load_detector_pool
+from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.telemetry.mqtt_auth import load_credentials
 from bikeped.types import Frame, Sound
 
@@ -111,7 +111,7 @@ def _bounded(check: Check, loaded: LoadedConfig) -> Finding:
 
 def check_configuration(loaded: LoadedConfig) -> Finding:
     """Whether lens, framing and ground fit together."""
-    camera = Viewpoint(loaded).camera
+    camera = GroundMapper(loaded).camera
     return Finding(
         "configuration",
         "ok",
@@ -129,7 +129,7 @@ def check_camera(loaded: LoadedConfig) -> Finding:
     except CaptureError as error:
         return _held_by_service("camera", *_split(str(error)))
     last = frames[-1]
-    Viewpoint(loaded).framing_of(last.width, last.height)
+    GroundMapper(loaded).framing_for(last.width, last.height)
     began = time.perf_counter()
     if last.jpeg is not None:
         JpegDecoder().decode(last.jpeg)
@@ -185,18 +185,18 @@ def check_model(loaded: LoadedConfig) -> Finding:
     """Loads the model and looks at a grey frame a few times."""
     camera = loaded.config.camera
     began = time.perf_counter()
-    eye = load_eye(loaded)
+    detector = load_detector_pool(loaded)
     loaded_s = time.perf_counter() - began
-    width, height = eye.decode_size(camera.width, camera.height)
+    width, height = detector.decode_size(camera.width, camera.height)
     rgb = np.full((height, width, 3), 114, np.uint8)
     frame = Frame(0, 0.0, camera.width, camera.height, rgb=rgb)
     times = []
     for _ in range(5):
         began = time.perf_counter()
-        eye.see(Picture(frame, rgb, began, 0.0, 0.0))
+        detector.detect(Picture(frame, rgb, began, 0.0, 0.0))
         times.append((time.perf_counter() - began) * 1e3)
     ms = statistics.median(times)
-    detail = f"{eye.name}: {ms:.1f} ms a frame, loaded in {loaded_s:.1f} s"
+    detail = f"{detector.name}: {ms:.1f} ms a frame, loaded in {loaded_s:.1f} s"
     if loaded.config.detection.model == BUNDLED:
         return Finding("model", "warn", f"{detail}; {NOT_FOR_STREETS}", "name a model of real ones")
     if ms > 1e3 / camera.fps:

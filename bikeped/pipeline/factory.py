@@ -12,12 +12,12 @@ from bikeped.config import DetectionConfig, LoadedConfig, road_region
 from bikeped.cores import cores
 from bikeped.detection.load import load_detector
 from bikeped.errors import DetectorError
-from bikeped.pipeline.detection_stage import MOST_LOOKS, Eye, ModelEye
+from bikeped.pipeline.detection_stage import MAX_INFLIGHT, DetectorPool, FrameDetector
 from bikeped.telemetry.builders import EventHeader, event_header
 from bikeped.telemetry.mqtt import MqttPublisher
 
 
-def load_eye(loaded: LoadedConfig, *, recorded: bool = False) -> ModelEye:
+def load_detector_pool(loaded: LoadedConfig, *, recorded: bool = False) -> DetectorPool:
     """The configured model; DetectorError names the key and the mend.
 
     `recorded`: it looks at a recording, where the rate counts and nothing waits for one frame. On a
@@ -31,11 +31,11 @@ def load_eye(loaded: LoadedConfig, *, recorded: bool = False) -> ModelEye:
             "file there, or with --set detection.model=FILE"
         )
     road = road_region(loaded)
-    threads = cores() // MOST_LOOKS
+    threads = cores() // MAX_INFLIGHT
     if not (recorded and threads and detection.threads == 0 and _on_cpu(detection)):
-        return ModelEye(load_detector(detection, base, road))
+        return DetectorPool(load_detector(detection, base, road))
     shared = msgspec.structs.replace(detection, threads=threads)
-    return ModelEye(*(load_detector(shared, base, road) for _ in range(MOST_LOOKS)))
+    return DetectorPool(*(load_detector(shared, base, road) for _ in range(MAX_INFLIGHT)))
 
 
 def _on_cpu(detection: DetectionConfig) -> bool:
@@ -47,12 +47,12 @@ def _on_cpu(detection: DetectionConfig) -> bool:
     return runs_on_cpu(detection.providers)
 
 
-def header_of(loaded: LoadedConfig, eye: Eye) -> EventHeader:
+def header_of(loaded: LoadedConfig, detector: FrameDetector) -> EventHeader:
     """The header of an event file or audit log that starts now."""
     return event_header(
         config_hash=loaded.hash,
         calibration_hash=loaded.calibration_hash,
-        model_hash=eye.model_hash,
+        model_hash=detector.model_hash,
         version=__version__,
         started_unix_s=time.time(),
     )

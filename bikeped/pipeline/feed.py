@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from bikeped.capture import FrameGrabber, FrameSource
-from bikeped.pipeline.worker_threads import Worker
+from bikeped.pipeline.worker_threads import WorkerThread
 from bikeped.types import Frame
 
 
@@ -84,7 +84,7 @@ class RecordedFeed:
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
-        self._reader = Worker("read")
+        self._reader = WorkerThread("read")
         self._ahead: asyncio.Future[tuple[Frame | None, float]] | None = None
 
     async def next(self) -> tuple[Frame, float] | None:

@@ -9,7 +9,7 @@ from bikeped.geometry import Framing, GroundTable
 from bikeped.types import Detections, GroundPoints
 
 
-class Viewpoint:
+class GroundMapper:
     """The configured camera, its framing and its ground table.
 
     Made from a configuration whose lens, framing and ground do not fit together, it raises
@@ -27,7 +27,7 @@ class Viewpoint:
         self._max_range_m = loaded.config.tracking.max_range_m
         self._framings: dict[tuple[int, int], Framing] = {}
 
-    def framing_of(self, width: int, height: int) -> Framing:
+    def framing_for(self, width: int, height: int) -> Framing:
         """The framing of frames of this size; GeometryError when they are another camera's."""
         known = self._framings.get((width, height))
         if known is None:

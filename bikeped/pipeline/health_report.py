@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from bikeped.pipeline.loop import Loop
-from bikeped.pipeline.rate_limited_log import Seldom
+from bikeped.pipeline.rate_limited_log import RateLimitedLogger
 from bikeped.pipeline.telemetry import Telemetry
 from bikeped.telemetry.builders import HealthMessage
 
@@ -28,7 +28,7 @@ async def report_health(
     light_errors: Callable[[], int] = lambda: 0,
 ) -> None:
     """Until cancelled. A failure here costs a message, never more."""
-    seldom = Seldom(log)
+    limited_log = RateLimitedLogger(log)
     next_health_s = next_log_s = -math.inf
     while True:
         try:
@@ -42,7 +42,7 @@ async def report_health(
                     next_log_s = now_s + LOG_EVERY_S
                     log.info("%s", health_line(message))
         except Exception as error:  # noqa: BLE001
-            seldom.failure("health", error)
+            limited_log.failure("health", error)
         await asyncio.sleep(min(MEASURE_EVERY_S, interval_s))
 
 

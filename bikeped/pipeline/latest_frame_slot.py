@@ -9,7 +9,7 @@ from typing import Any
 from bikeped.pipeline.detection_stage import Picture
 
 
-class Slot:
+class LatestFrameSlot:
     """Room for one picture between two workers; None, put last, is the end."""
 
     def __init__(self) -> None:

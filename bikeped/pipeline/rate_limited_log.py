@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 
-class Seldom:
+class RateLimitedLogger:
     """Says at most one line a subject every `every_s` seconds, and how many it kept back."""
 
     def __init__(

@@ -17,17 +17,23 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback import LightDriver, SignalLogic, SimulatedLight
 from bikeped.overlay import VideoWriter
-from bikeped.pipeline.detection_stage import Eye, ModelEye, Vision
-from bikeped.pipeline.factory import header_of, load_eye, start_publisher
+from bikeped.pipeline.detection_stage import DetectionStage, DetectorPool, FrameDetector
+from bikeped.pipeline.factory import header_of, load_detector_pool, start_publisher
 from bikeped.pipeline.feed import RecordedFeed
-from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.health_report import report_health
 from bikeped.pipeline.loop import Loop, Output
-from bikeped.pipeline.replay_outputs import OVERLAY_SIZE, EventFile, OverlayVideo, Progress, Tally
-from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.replay_outputs import (
+    OVERLAY_SIZE,
+    EventFile,
+    OverlayVideo,
+    Progress,
+    ReplaySummary,
+)
+from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.telemetry import Telemetry
-from bikeped.pipeline.track_and_decide import Judge
-from bikeped.pipeline.web_context import Inside, Pages, open_pages
+from bikeped.pipeline.track_and_decide import TrackAndDecide
+from bikeped.pipeline.web_context import Pages, WebContext, open_pages
 from bikeped.telemetry.builders import HealthMessage
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
@@ -52,7 +58,7 @@ class ReplayFiles:
 class ReplayResult:
     """What a replay found."""
 
-    tally: Tally
+    summary: ReplaySummary
     times: StageTimes
     frames: int
     undecodable: int
@@ -64,17 +70,17 @@ class ReplayResult:
 
     def as_dict(self) -> dict[str, Any]:
         """The summary, for `--json`."""
-        tally = self.tally
+        summary = self.summary
         return {
             "frames": self.frames,
             "interrupted": self.interrupted,
             "undecodable": self.undecodable,
-            "duration_s": round(tally.duration_s, 3),
-            "states": dict(sorted(tally.states.items())),
-            "tracks": {kind: len(ids) for kind, ids in sorted(tally.tracks.items())},
-            "alerts": tally.alerts,
-            "detections": tally.detections,
-            "not_on_ground": tally.not_on_ground,
+            "duration_s": round(summary.duration_s, 3),
+            "states": dict(sorted(summary.states.items())),
+            "tracks": {kind: len(ids) for kind, ids in sorted(summary.tracks.items())},
+            "alerts": summary.alerts,
+            "detections": summary.detections,
+            "not_on_ground": summary.not_on_ground,
             "warnings": list(self.warnings),
             "detector": self.detector,
             "config_hash": self.config_hash,
@@ -90,7 +96,7 @@ def replay(
     loaded: LoadedConfig,
     recording: str,
     *,
-    eye: Eye | None = None,
+    detector: FrameDetector | None = None,
     own_camera: bool = False,
     files: ReplayFiles = ReplayFiles(),
     realtime: bool = False,
@@ -101,8 +107,9 @@ def replay(
 ) -> ReplayResult:
     """Runs a recording through the loop; raises BikepedError with one line that says the mend.
 
-    `eye` in place of the configured model belongs to the recording, so its size is no surprise; nor
-    is it where the configured camera is known to have made it (`own_camera`).
+    `detector` replaces the configured model; it belongs to the recording. A recording of another
+    size than the configured camera's is warned about unless `detector` is given or the configured
+    camera made it (`own_camera`).
     `pages` are served while it runs; `serving` gets their address.
     """
     camera = loaded.config.camera
@@ -112,19 +119,25 @@ def replay(
     with contextlib.closing(source):
         if source.live:
             raise BikepedError(f"{source.name}: is a camera, not a recording; use bikeped run")
-        viewpoint = Viewpoint(loaded)
+        ground_mapper = GroundMapper(loaded)
         try:
-            viewpoint.framing_of(source.width, source.height)
+            ground_mapper.framing_for(source.width, source.height)
         except GeometryError as error:
             raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
-        warnings = [] if own_camera or eye is not None else _size_warnings(loaded, source)
-        looking = eye if eye is not None else load_eye(loaded, recorded=not realtime)
-        judge = Judge(loaded, riders_whole=looking.riders_whole, viewpoint=viewpoint)
+        warnings = [] if own_camera or detector is not None else _size_warnings(loaded, source)
+        looking = (
+            detector if detector is not None else load_detector_pool(loaded, recorded=not realtime)
+        )
+        track_and_decide = TrackAndDecide(
+            loaded,
+            cyclist_box_includes_rider=looking.cyclist_box_includes_rider,
+            ground_mapper=ground_mapper,
+        )
         return asyncio.run(
             _replay(
                 loaded,
                 PacedSource(source) if realtime else source,
-                judge,
+                track_and_decide,
                 looking,
                 files,
                 mqtt and loaded.config.mqtt.enabled,
@@ -139,8 +152,8 @@ def replay(
 async def _replay(
     loaded: LoadedConfig,
     source: FrameSource,
-    judge: Judge,
-    eye: Eye,
+    track_and_decide: TrackAndDecide,
+    detector: FrameDetector,
     files: ReplayFiles,
     mqtt: bool,
     outputs: list[Output],
@@ -149,21 +162,23 @@ async def _replay(
     serving: Callable[[str], None] | None,
 ) -> ReplayResult:
     config = loaded.config
-    tally = Tally()
+    summary = ReplaySummary()
     async with contextlib.AsyncExitStack() as stack:
         publisher = await start_publisher(loaded, stack) if mqtt else None
         metrics = Metrics() if pages is not None else None
         telemetry = Telemetry(
-            loaded, judge, publisher=publisher, metrics=metrics, remember=REMEMBER
+            loaded, track_and_decide, publisher=publisher, metrics=metrics, remember=REMEMBER
         )
         watchers = [] if pages is None else [pages]
-        outputs = [tally, telemetry, *outputs, *watchers]
+        outputs = [summary, telemetry, *outputs, *watchers]
         if files.events is not None:
-            outputs.append(stack.enter_context(EventFile(files.events, header_of(loaded, eye))))
+            outputs.append(
+                stack.enter_context(EventFile(files.events, header_of(loaded, detector)))
+            )
         if files.overlay is not None:
             fps = source.fps if source.fps > 0 else 30.0
             overlay = OverlayVideo(
-                stack.enter_context(VideoWriter(files.overlay, fps, OVERLAY_SIZE)), judge
+                stack.enter_context(VideoWriter(files.overlay, fps, OVERLAY_SIZE)), track_and_decide
             )
             outputs.append(overlay)
             stack.push_async_callback(overlay.wait)
@@ -176,29 +191,29 @@ async def _replay(
         stack.push_async_callback(asyncio.to_thread, light.close)
         loop = Loop(
             feed=RecordedFeed(source),
-            vision=Vision(eye, OVERLAY_SIZE[0] if files.overlay is not None else 0),
-            judge=judge,
-            announcer=Announcer(
+            detection=DetectionStage(detector, OVERLAY_SIZE[0] if files.overlay is not None else 0),
+            track_and_decide=track_and_decide,
+            dispatcher=SignalDispatcher(
                 SignalLogic.from_config(config.feedback), light, listeners=(telemetry, *watchers)
             ),
             outputs=outputs,
-            looks_at_once=eye.at_once if isinstance(eye, ModelEye) else 1,
+            max_inflight=detector.at_once if isinstance(detector, DetectorPool) else 1,
         )
 
         def health() -> HealthMessage:
             return telemetry.health(loop, "simulated")
 
         if pages is not None and metrics is not None:
-            inside = Inside(
+            web_context = WebContext(
                 loaded=loaded,
-                judge=judge,
+                track_and_decide=track_and_decide,
                 source=source.name,
-                detector=eye.name,
+                detector=detector.name,
                 health=health,
                 metrics=metrics.registry,
                 mqtt=None if publisher is None else lambda: publisher.status,
             )
-            server = await open_pages(pages, inside, config.web, stack)
+            server = await open_pages(pages, web_context, config.web, stack)
             if server.error is not None:
                 raise BikepedError(server.error)
             if serving is not None:
@@ -222,15 +237,15 @@ async def _replay(
                 f"{source.name}: no frame could be read ({loop.counts.undecodable} did not "
                 "decode); check the recording"
             )
-    warnings.extend(_ground_warnings(loaded, tally))
+    warnings.extend(_ground_warnings(loaded, summary))
     return ReplayResult(
-        tally=tally,
+        summary=summary,
         times=telemetry.times,
         frames=loop.counts.frames,
         undecodable=loop.counts.undecodable,
         wall_s=wall_s,
         config_hash=loaded.hash,
-        detector=eye.name,
+        detector=detector.name,
         warnings=tuple(warnings),
         interrupted=loop.stopping,
     )
@@ -248,13 +263,13 @@ def _size_warnings(loaded: LoadedConfig, source: FrameSource) -> list[str]:
     return [text]
 
 
-def _ground_warnings(loaded: LoadedConfig, tally: Tally) -> list[str]:
-    if tally.detections < ENOUGH_DETECTIONS or 2 * tally.not_on_ground <= tally.detections:
+def _ground_warnings(loaded: LoadedConfig, summary: ReplaySummary) -> list[str]:
+    if summary.detections < ENOUGH_DETECTIONS or 2 * summary.not_on_ground <= summary.detections:
         return []
     text = (
-        f"{tally.not_on_ground} of {tally.detections} detections end above the horizon or outside "
-        f"the image circle: {loaded.source} is for another camera or mounting; set the camera "
-        "section (projection, fov_deg, radius_px, pitch_deg) to the one that recorded this"
+        f"{summary.not_on_ground} of {summary.detections} detections end above the horizon or "
+        f"outside the image circle: {loaded.source} is for another camera or mounting; set the "
+        "camera section (projection, fov_deg, radius_px, pitch_deg) to the one that recorded this"
     )
     log.warning("%s", text)
     return [text]

@@ -1,4 +1,4 @@
-"""What a replay leaves behind: the tally, the event file, the overlay video."""
+"""What a replay leaves behind: the summary, the event file, the overlay video."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from bikeped.overlay import OverlayData, VideoWriter, compose, ground_projector
-from bikeped.pipeline.loop import Outcome
+from bikeped.pipeline.loop import FrameResult
 from bikeped.pipeline.telemetry import event_line_for
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.builders import EventHeader
 from bikeped.telemetry.events import EventWriter
 from bikeped.types import Kind, State
@@ -24,7 +24,7 @@ OVERLAY_SIZE = (1600, 720)
 
 
 @dataclass
-class Tally:
+class ReplaySummary:
     """What a replay adds up: states, kinds, alert episodes."""
 
     states: dict[str, int] = field(default_factory=dict)
@@ -35,20 +35,20 @@ class Tally:
     duration_s: float = 0.0
     _alerting: bool = False
 
-    async def frame(self, outcome: Outcome) -> None:
-        frame, judgement = outcome.picture.frame, outcome.judgement
-        self.duration_s = outcome.t_s
-        self.detections += len(outcome.detections)
-        self.not_on_ground += judgement.not_on_ground
-        decision = judgement.decision
+    async def on_frame_result(self, result: FrameResult) -> None:
+        frame, tracking = result.picture.frame, result.tracking
+        self.duration_s = result.t_s
+        self.detections += len(result.detections)
+        self.not_on_ground += tracking.not_on_ground
+        decision = tracking.decision
         self.states[decision.state.name] = self.states.get(decision.state.name, 0) + 1
-        for key, kind in zip(judgement.tracks.id.tolist(), judgement.tracks.kind, strict=True):
+        for key, kind in zip(tracking.tracks.id.tolist(), tracking.tracks.kind, strict=True):
             self.tracks.setdefault(Kind(kind).label, set()).add(key)
         alerting = decision.state is State.ALERT
         if alerting and not self._alerting:
             self.alerts.append(
                 {
-                    "t": round(outcome.t_s, 3),
+                    "t": round(result.t_s, 3),
                     "frame": frame.number,
                     "sentence": decision.sentence,
                     "frames": 0,
@@ -65,8 +65,8 @@ class EventFile:
     def __init__(self, path: Path, header: EventHeader) -> None:
         self._writer = EventWriter(path, header)
 
-    async def frame(self, outcome: Outcome) -> None:
-        self._writer.write(event_line_for(outcome))
+    async def on_frame_result(self, result: FrameResult) -> None:
+        self._writer.write(event_line_for(result))
 
     def __enter__(self) -> EventFile:
         return self
@@ -85,36 +85,36 @@ class EventFile:
 class OverlayVideo:
     """The overlay video of a replay: drawn in a thread, while the next frame is looked at."""
 
-    def __init__(self, sink: VideoWriter, judge: Judge) -> None:
-        self._sink, self._judge = sink, judge
-        self._fov_deg = math.degrees(2 * judge.viewpoint.camera.lens.max_theta_rad)
+    def __init__(self, sink: VideoWriter, track_and_decide: TrackAndDecide) -> None:
+        self._sink, self._track_and_decide = sink, track_and_decide
+        self._fov_deg = math.degrees(2 * track_and_decide.ground_mapper.camera.lens.max_theta_rad)
         self._drawing: asyncio.Task[None] | None = None
 
-    async def frame(self, outcome: Outcome) -> None:
+    async def on_frame_result(self, result: FrameResult) -> None:
         await self.wait()
-        frame, judgement = outcome.picture.frame, outcome.judgement
+        frame, tracking = result.picture.frame, result.tracking
         overlay_data = OverlayData(
-            detections=outcome.detections,
-            tracks=judgement.tracks,
-            decision=judgement.decision,
+            detections=result.detections,
+            tracks=tracking.tracks,
+            decision=tracking.decision,
             frame_number=frame.number,
-            time_s=outcome.t_s,
-            latency_s=outcome.latency_ms["total"] / 1e3,
-            history={k: np.asarray(v) for k, v in self._judge.tracker.history().items()},
+            time_s=result.t_s,
+            latency_s=result.latency_ms["total"] / 1e3,
+            history={k: np.asarray(v) for k, v in self._track_and_decide.tracker.history().items()},
         )
-        framing = self._judge.viewpoint.framing_of(frame.width, frame.height)
-        projector = ground_projector(self._judge.viewpoint.camera, framing)
+        framing = self._track_and_decide.ground_mapper.framing_for(frame.width, frame.height)
+        projector = ground_projector(self._track_and_decide.ground_mapper.camera, framing)
 
         def draw() -> None:
             self._sink.write(
                 compose(
-                    outcome.picture.rgb,
+                    result.picture.rgb,
                     overlay_data,
                     self._sink.size,
                     frame_width=frame.width,
                     ground_to_frame=projector,
                     fov_deg=self._fov_deg,
-                    heading_deg=self._judge.viewpoint.camera.heading_deg,
+                    heading_deg=self._track_and_decide.ground_mapper.camera.heading_deg,
                 )
             )
 
@@ -139,6 +139,6 @@ class Progress:
     def __init__(self, tell: Callable[[int], None]) -> None:
         self._tell, self._frames = tell, 0
 
-    async def frame(self, outcome: Outcome) -> None:
+    async def on_frame_result(self, result: FrameResult) -> None:
         self._frames += 1
         self._tell(self._frames)

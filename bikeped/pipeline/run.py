@@ -18,18 +18,18 @@ from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
 from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_driver, open_speaker
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
-from bikeped.pipeline.detection_stage import Eye, Vision
-from bikeped.pipeline.factory import header_of, load_eye, start_publisher
+from bikeped.pipeline.detection_stage import DetectionStage, FrameDetector
+from bikeped.pipeline.factory import header_of, load_detector_pool, start_publisher
 from bikeped.pipeline.feed import LiveFeed
-from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.health_report import report_health
-from bikeped.pipeline.loop import Hung, Limits, Loop
-from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.loop import Limits, Loop, StageHangError
+from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.systemd import Notifier
 from bikeped.pipeline.telemetry import Telemetry
-from bikeped.pipeline.track_and_decide import Judge
-from bikeped.pipeline.web_context import Inside, Pages, open_pages
-from bikeped.pipeline.worker_threads import Worker
+from bikeped.pipeline.track_and_decide import TrackAndDecide
+from bikeped.pipeline.web_context import Pages, WebContext, open_pages
+from bikeped.pipeline.worker_threads import WorkerThread
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import HealthMessage
 from bikeped.telemetry.metrics import Metrics
@@ -42,7 +42,9 @@ _REFRESH_S = 0.25
 LOADING = Fault("starting", "service.starting", "loading the model")
 
 
-def run_service(loaded: LoadedConfig, *, eye: Eye | None = None, pages: Pages | None = None) -> int:
+def run_service(
+    loaded: LoadedConfig, *, detector: FrameDetector | None = None, pages: Pages | None = None
+) -> int:
     """The service until SIGTERM or SIGINT; its exit status: 0, or that of the fault that ended it.
 
     `pages` is what `web` serves; None serves nothing.
@@ -50,10 +52,10 @@ def run_service(loaded: LoadedConfig, *, eye: Eye | None = None, pages: Pages | 
     Raises BikepedError for what only a person can mend. A thread that hangs is left behind, so the
     caller should end the process without joining threads (see `bikeped.cli.run`).
     """
-    return asyncio.run(_run(loaded, eye, pages))
+    return asyncio.run(_run(loaded, detector, pages))
 
 
-async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> int:
+async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Pages | None) -> int:
     stop = asyncio.Event()
     for number in (signals.SIGTERM, signals.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -68,7 +70,7 @@ async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> in
     )
     provenance = check_provenance(loaded)
     log.log(logging.INFO if provenance.holds else logging.WARNING, "%s", provenance.text)
-    viewpoint = Viewpoint(loaded)
+    ground_mapper = GroundMapper(loaded)
     light = light_driver(loaded.config.feedback)
     notifier = Notifier()
     async with contextlib.AsyncExitStack() as last:
@@ -76,22 +78,28 @@ async def _run(loaded: LoadedConfig, eye: Eye | None, pages: Pages | None) -> in
         light.start()  # FAULT until told otherwise
         # The last act, whatever ends the service.
         last.push_async_callback(_darken, light)
-        if eye is None:
-            eye = await _load_while_alive(loaded, light, notifier, stop)
-        if eye is None:
+        if detector is None:
+            detector = await _load_while_alive(loaded, light, notifier, stop)
+        if detector is None:
             return 0
-        log.info("detector: %s, sha256 %s", eye.name, eye.model_hash or "none")
-        judge = Judge(loaded, riders_whole=eye.riders_whole, viewpoint=viewpoint)
+        log.info("detector: %s, sha256 %s", detector.name, detector.model_hash or "none")
+        track_and_decide = TrackAndDecide(
+            loaded,
+            cyclist_box_includes_rider=detector.cyclist_box_includes_rider,
+            ground_mapper=ground_mapper,
+        )
         if loaded.config.detection.model == BUNDLED:
             log.warning("detection.model: %s", NOT_FOR_STREETS)
         async with contextlib.AsyncExitStack() as stack:
-            return await _serve(loaded, judge, eye, light, notifier, stop, stack, last, pages)
+            return await _serve(
+                loaded, track_and_decide, detector, light, notifier, stop, stack, last, pages
+            )
 
 
 async def _serve(
     loaded: LoadedConfig,
-    judge: Judge,
-    eye: Eye,
+    track_and_decide: TrackAndDecide,
+    detector: FrameDetector,
     light: LightDriver,
     notifier: Notifier,
     stop: asyncio.Event,
@@ -106,22 +114,24 @@ async def _serve(
     publisher = await start_publisher(loaded, stack) if config.mqtt.enabled else None
     audit = None
     if config.audit.path is not None:
-        audit = AuditLog(config.audit, header_of(loaded, eye), base_dir=loaded.base_dir)
+        audit = AuditLog(config.audit, header_of(loaded, detector), base_dir=loaded.base_dir)
         audit.start()
         stack.push_async_callback(asyncio.to_thread, audit.close)
     metrics = Metrics() if pages is not None else None
     watchers = () if pages is None else (pages,)
-    telemetry = Telemetry(loaded, judge, publisher=publisher, audit=audit, metrics=metrics)
-    announcer = Announcer(
+    telemetry = Telemetry(
+        loaded, track_and_decide, publisher=publisher, audit=audit, metrics=metrics
+    )
+    dispatcher = SignalDispatcher(
         SignalLogic.from_config(config.feedback), light, speaker, listeners=(telemetry, *watchers)
     )
     grabber = FrameGrabber(partial(_open_camera, loaded), stale_after_s=camera.stale_after_s)
     grabber.start()
     loop = Loop(
         feed=LiveFeed(grabber),
-        vision=Vision(eye),
-        judge=judge,
-        announcer=announcer,
+        detection=DetectionStage(detector),
+        track_and_decide=track_and_decide,
+        dispatcher=dispatcher,
         outputs=(telemetry, *watchers),
         limits=Limits(
             stale_after_s=camera.stale_after_s,
@@ -138,16 +148,16 @@ async def _serve(
         return telemetry.health(loop, config.feedback.light, tuple(faults))
 
     if pages is not None and metrics is not None:
-        inside = Inside(
+        web_context = WebContext(
             loaded=loaded,
-            judge=judge,
+            track_and_decide=track_and_decide,
             source=camera.source,
-            detector=eye.name,
+            detector=detector.name,
             health=health,
             metrics=metrics.registry,
             mqtt=None if publisher is None else lambda: publisher.status,
         )
-        await open_pages(pages, inside, config.web, stack)
+        await open_pages(pages, web_context, config.web, stack)
     tasks = (
         asyncio.create_task(_stop_when(stop, loop)),
         asyncio.create_task(
@@ -159,7 +169,7 @@ async def _serve(
     notifier.ready(f"watching {camera.source}")
     try:
         await loop.run()
-    except Hung as hang:
+    except StageHangError as hang:
         log.critical("%s; ending so that a fresh process can start", hang)
         return hang.fault.kind.exit_status or 0
     finally:
@@ -167,7 +177,7 @@ async def _serve(
         for task in tasks:
             task.cancel()
         # Stopping the rest may take seconds, in which the light must not look unattended.
-        last.callback(asyncio.create_task(_refresh(announcer)).cancel)
+        last.callback(asyncio.create_task(_refresh(dispatcher)).cancel)
         telemetry.publish_health(health())
         log.info("latency\n%s", telemetry.times.table())
     return 0
@@ -188,15 +198,15 @@ def _open_camera(loaded: LoadedConfig) -> FrameSource:
 
 async def _load_while_alive(
     loaded: LoadedConfig, light: LightDriver, notifier: Notifier, stop: asyncio.Event
-) -> Eye | None:
+) -> FrameDetector | None:
     """Loads the model in a thread (an engine may take minutes to build), showing FAULT meanwhile.
 
     None when the service was asked to stop before. Past LOAD_LIMIT_S systemd is no longer asked for
     patience, and ends the process.
     """
     starting = fault_signal((LOADING,), loaded.config.feedback.fault_blink_hz)
-    worker = Worker("load")
-    loading = worker.submit(load_eye, loaded)
+    worker = WorkerThread("load")
+    loading = worker.submit(load_detector_pool, loaded)
     stopping = asyncio.create_task(stop.wait())
     either: set[asyncio.Future[Any]] = {loading, stopping}
     began_s = time.monotonic()
@@ -219,9 +229,9 @@ async def _stop_when(stop: asyncio.Event, loop: Loop) -> None:
     loop.stop()
 
 
-async def _refresh(announcer: Announcer) -> None:
+async def _refresh(dispatcher: SignalDispatcher) -> None:
     while True:
-        announcer.refresh()
+        dispatcher.refresh()
         await asyncio.sleep(_REFRESH_S)
 
 

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from bikeped.faults import Fault, fault_texts
 from bikeped.feedback import OFF, LightDriver, SignalLogic, Speaker
-from bikeped.pipeline.rate_limited_log import Seldom
+from bikeped.pipeline.rate_limited_log import RateLimitedLogger
 from bikeped.types import Decision, Signal
 
 log = logging.getLogger(__name__)
@@ -19,14 +19,14 @@ STOPPED = "OFF: the service was stopped."
 class SignalListener(Protocol):
     """Hears of every signal."""
 
-    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+    def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
         """What the light shows now, why, and the newest decision; with every frame and every tick.
 
         Must not block.
         """
 
 
-class Announcer:
+class SignalDispatcher:
     """Lets `logic` choose the signal and tells everybody. The light comes first."""
 
     def __init__(
@@ -39,7 +39,7 @@ class Announcer:
         self._logic, self._light, self._speaker = logic, light, speaker
         self._listeners = tuple(listeners)
         self._decision: Decision | None = None
-        self._seldom = Seldom(log)
+        self._limited_log = RateLimitedLogger(log)
         self.shown: Signal | None = None
 
     def step(
@@ -78,6 +78,6 @@ class Announcer:
 
     def _tell_listener(self, listener: SignalListener, signal: Signal, sentence: str) -> None:
         try:
-            listener.signal(signal, sentence, self._decision)
+            listener.on_signal(signal, sentence, self._decision)
         except Exception as error:  # noqa: BLE001 - telemetry must not darken the light
-            self._seldom.failure("listener", error)
+            self._limited_log.failure("listener", error)

@@ -13,8 +13,8 @@ import msgspec
 from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.faults import Component, Fault, fault_texts
-from bikeped.pipeline.loop import Loop, Outcome
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.loop import FrameResult, Loop
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import (
     ComponentStatus,
@@ -43,7 +43,7 @@ class Telemetry:
     def __init__(
         self,
         loaded: LoadedConfig,
-        judge: Judge,
+        track_and_decide: TrackAndDecide,
         *,
         publisher: MqttPublisher | None = None,
         audit: AuditLog | None = None,
@@ -52,7 +52,7 @@ class Telemetry:
         wall_clock: Callable[[], float] = time.time,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._loaded, self._judge = loaded, judge
+        self._loaded, self._track_and_decide = loaded, track_and_decide
         self._mqtt, self._audit, self._metrics = publisher, audit, metrics
         self._wall, self._clock = wall_clock, clock
         self.times = StageTimes(remember)
@@ -61,34 +61,34 @@ class Telemetry:
         self._next_tracks_s = -math.inf
         self._started_s = clock()
         self._recent: deque[float] = deque(maxlen=240)  # when frames were judged
-        self._last: Outcome | None = None
+        self._last: FrameResult | None = None
         self._signal: Signal | None = None
 
-    async def frame(self, outcome: Outcome) -> None:
-        self._last = outcome
+    async def on_frame_result(self, result: FrameResult) -> None:
+        self._last = result
         now_s = self._clock()
         self._recent.append(now_s)
-        self.times.add(outcome.latency_ms)
+        self.times.add(result.latency_ms)
         if self._metrics is not None:
             self._metrics.count_frame(
-                detections=outcome.detections,
-                tracks=outcome.judgement.tracks,
-                latency_ms=outcome.latency_ms,
+                detections=result.detections,
+                tracks=result.tracking.tracks,
+                latency_ms=result.latency_ms,
             )
         if self._audit is not None:
-            self._audit.write(event_line_for(outcome))
+            self._audit.write(event_line_for(result))
         if self._mqtt is not None and now_s >= self._next_tracks_s:
             self._next_tracks_s = self._due(now_s)
             message = tracks_message(
-                unix_s=self._wall() - outcome.latency_ms["capture_age"] / 1e3,
-                frame_number=outcome.picture.frame.number,
-                state=_shown(outcome.signal),
-                tracks=outcome.judgement.tracks,
-                history=self._judge.tracker.history(),
+                unix_s=self._wall() - result.latency_ms["capture_age"] / 1e3,
+                frame_number=result.picture.frame.number,
+                state=_shown(result.signal),
+                tracks=result.tracking.tracks,
+                history=self._track_and_decide.tracker.history(),
             )
             self._mqtt.publish("tracks", encode(message))
 
-    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+    def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
         self._signal = signal
         if self._metrics is not None:
             self._metrics.set_state(_shown(signal))
@@ -180,16 +180,16 @@ class Telemetry:
         return max(self._next_tracks_s + interval_s, now_s + interval_s / 2)
 
 
-def event_line_for(outcome: Outcome) -> EventLine:
-    """The event line of an outcome."""
+def event_line_for(result: FrameResult) -> EventLine:
+    """The event line of an result."""
     return event_line(
-        t_s=outcome.t_s,
-        frame=outcome.picture.frame.number,
-        decision=outcome.judgement.decision,
-        tracks=outcome.judgement.tracks,
-        detections=outcome.detections,
-        latency_ms=outcome.latency_ms,
-        light=_shown(outcome.signal),
+        t_s=result.t_s,
+        frame=result.picture.frame.number,
+        decision=result.tracking.decision,
+        tracks=result.tracking.tracks,
+        detections=result.detections,
+        latency_ms=result.latency_ms,
+        light=_shown(result.signal),
     )
 
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 from bikeped.config import LoadedConfig, rule_settings, tracker_settings
 from bikeped.decision import Decider
-from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.tracking import Tracker, predict
 from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 
 
 @dataclass(frozen=True)
-class Judgement:
+class TrackingResult:
     """What one frame led to; `track_ms` and `decide_ms` are how long that took.
 
     `not_on_ground` detections end above the horizon or outside the image circle: a few are
@@ -33,26 +33,25 @@ class Judgement:
     decide_ms: float
 
 
-class Judge:
+class TrackAndDecide:
     """Judges frames in order of their capture times."""
 
     def __init__(
         self,
         loaded: LoadedConfig,
         *,
-        riders_whole: bool = False,
-        viewpoint: Viewpoint | None = None,
+        cyclist_box_includes_rider: bool = False,
+        ground_mapper: GroundMapper | None = None,
     ) -> None:
-        """`riders_whole`: of the detector (`Detector.riders_whole`). `viewpoint`: that of `loaded`,
-        where it has been made already."""
+        """`cyclist_box_includes_rider`: as the detector says; `ground_mapper`: if already made."""
         config = loaded.config
         fps = config.decision.nominal_fps
-        self.viewpoint = viewpoint or Viewpoint(loaded)
+        self.ground_mapper = ground_mapper or GroundMapper(loaded)
         self._tracker_settings = tracker_settings(
             config.tracking,
             fps,
             acceleration=config.latency.order == 2,
-            riders_whole=riders_whole,
+            cyclist_box_includes_rider=cyclist_box_includes_rider,
         )
         self._speed_window_s = config.tracking.speed_window_frames / fps
         self._history = config.tracking.history_frames
@@ -67,28 +66,28 @@ class Judge:
         self._decider = Decider(self._rule)
         self._last_s = -math.inf
 
-    def judge(
+    def update(
         self, detections: Detections, width: int, height: int, captured_s: float, age_s: float
-    ) -> Judgement:
-        """The judgement of a frame of `width` x `height` captured at `captured_s`.
+    ) -> TrackingResult:
+        """Tracks and decides a frame of `width` x `height` captured at `captured_s`.
 
         `age_s` is how old the frame is now; the latency section says what is made of it. Capture
         times must increase: a frame that is not newer than the last one is a ValueError.
         """
         began = time.perf_counter()
-        view = self.viewpoint
-        points, not_on_ground = view.ground(detections, view.framing_of(width, height))
-        return self.judge_points(points, captured_s, age_s, not_on_ground, began)
+        view = self.ground_mapper
+        points, not_on_ground = view.ground(detections, view.framing_for(width, height))
+        return self.update_from_points(points, captured_s, age_s, not_on_ground, began)
 
-    def judge_points(
+    def update_from_points(
         self,
         points: GroundPoints,
         captured_s: float,
         age_s: float = 0.0,
         not_on_ground: int = 0,
         began: float | None = None,
-    ) -> Judgement:
-        """The judgement of what stands at `points`, as `judge` goes on after the ground table.
+    ) -> TrackingResult:
+        """Tracks and decides from ground points: what `update` does after the ground table.
 
         `began` is the `time.perf_counter()` from which `track_ms` counts; None: now.
         """
@@ -102,7 +101,7 @@ class Judge:
             captured_s, tracks.id, tracks.kind, self._ahead(tracks, age_s)
         )
         decided = time.perf_counter()
-        return Judgement(
+        return TrackingResult(
             points=points,
             not_on_ground=not_on_ground,
             tracks=tracks,

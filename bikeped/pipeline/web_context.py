@@ -13,18 +13,18 @@ from prometheus_client import CollectorRegistry
 from bikeped.config import LoadedConfig, WebConfig
 from bikeped.pipeline.loop import Output
 from bikeped.pipeline.signal_dispatcher import SignalListener
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.builders import HealthMessage
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.mqtt import MqttStatus
 
 
 @dataclass(frozen=True)
-class Inside:
+class WebContext:
     """What pages may look at. Nothing here changes what the service does."""
 
     loaded: LoadedConfig
-    judge: Judge
+    track_and_decide: TrackAndDecide
     source: str  #: the camera, or the recording
     detector: str
     health: Callable[[], HealthMessage]
@@ -33,17 +33,17 @@ class Inside:
 
 
 class Pages(Output, SignalListener, Protocol):
-    """Pages hear every outcome and every signal, put them aside, and return at once."""
+    """Pages hear every result and every signal, put them aside, and return at once."""
 
-    def application(self, inside: Inside) -> web.Application:
+    def application(self, web_context: WebContext) -> web.Application:
         """What is served, the monitoring included."""
 
 
 async def open_pages(
-    pages: Pages, inside: Inside, config: WebConfig, stack: contextlib.AsyncExitStack
+    pages: Pages, web_context: WebContext, config: WebConfig, stack: contextlib.AsyncExitStack
 ) -> HttpServer:
     """Serves the pages until `stack` unwinds. A port that cannot be bound is in `error`."""
-    server = HttpServer(pages.application(inside), config)
+    server = HttpServer(pages.application(web_context), config)
     await server.start()
     stack.push_async_callback(server.stop)
     return server

@@ -21,7 +21,7 @@ T = TypeVar("T")
 _Job = tuple["concurrent.futures.Future[Any]", Callable[[], Any]]
 
 
-class Worker:
+class WorkerThread:
     """One daemon thread that runs calls one after another, and knows for how long it has."""
 
     def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:

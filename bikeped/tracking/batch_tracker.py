@@ -48,9 +48,9 @@ class TrackerSettings:
     `rider_radius_m`: detectors see a small bicycle in some frames and only its rider in others. A
     person without a track, this near to a cyclist's track without a detection, is that cyclist (and
     the reverse), so that one rider does not become a cyclist and a pedestrian who meet. 0: never,
-    as in the paper's simulation, whose agents have one kind. `riders_whole`: the detector boxes
-    rider and cycle as one, so either kind says as much as the other: a track is what most of its
-    detections were lately. `acceleration`: whether it is estimated; only second-order prediction
+    as in the paper's simulation, whose agents have one kind. `cyclist_box_includes_rider`: the
+    detector boxes rider and cycle as one, so both kinds count alike and a track is what most of its
+    recent detections were. `acceleration`: whether it is estimated; only second-order prediction
     reads it.
     """
 
@@ -65,7 +65,7 @@ class TrackerSettings:
     unbiased: bool = False
     max_range_m: float = math.inf
     rider_radius_m: float = 0.0
-    riders_whole: bool = False
+    cyclist_box_includes_rider: bool = False
     acceleration: bool = True
 
 
@@ -248,7 +248,7 @@ class BatchTracker:
         share, kind = self._cycle_share.reshape(-1), self.kind.reshape(-1)
         if not np.count_nonzero(share[flat] != (seen == _CYCLIST)):
             return  # seen as they were always seen
-        whole = self.settings.riders_whole
+        whole = self.settings.cyclist_box_includes_rider
         # A young track has no past to hold against what it is seen as: all of its sights count.
         weight = np.maximum(_CYCLE_WEIGHT, 1 / self.hits.reshape(-1)[flat]) if whole else None
         share[flat] += (_CYCLE_WEIGHT if weight is None else weight) * (

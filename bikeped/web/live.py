@@ -18,7 +18,7 @@ import msgspec
 from aiohttp import hdrs, web
 
 from bikeped.config import WebConfig
-from bikeped.pipeline.web_context import Inside
+from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.latency import STAGES
 from bikeped.web.live_picture import PictureRenderer
 from bikeped.web.live_state import LiveState
@@ -39,11 +39,11 @@ _EDGE = f"\r\n--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n\r\n".encode()
 class LivePage:
     """The live page of one running service or replay."""
 
-    def __init__(self, state: LiveState, inside: Inside) -> None:
-        self._config: WebConfig = inside.loaded.config.web
-        self._state, self._inside = state, inside
+    def __init__(self, state: LiveState, web_context: WebContext) -> None:
+        self._config: WebConfig = web_context.loaded.config.web
+        self._state, self._web_context = state, web_context
         self.renderer = PictureRenderer(
-            state, inside.judge, self._config.stream_width, self._config.stream_fps
+            state, web_context.track_and_decide, self._config.stream_width, self._config.stream_fps
         )
         self._pages = self._streams = 0
         self._status: tuple[float, bytes] = (-1.0, b"")
@@ -122,21 +122,24 @@ class LivePage:
 
     def _hello(self) -> dict[str, Any]:
         """What does not change while the service runs."""
-        loaded, lens = self._inside.loaded, self._inside.judge.viewpoint.camera.lens
+        loaded, lens = (
+            self._web_context.loaded,
+            self._web_context.track_and_decide.ground_mapper.camera.lens,
+        )
         config = loaded.config
         return {
             "stages": STAGES,
             "config_hash": loaded.hash,
             "calibration_hash": loaded.calibration_hash,
-            "source": display_source(self._inside.source),
-            "detector": self._inside.detector,
+            "source": display_source(self._web_context.source),
+            "detector": self._web_context.detector,
             "light": config.feedback.light,
             "rule": config.decision.rule,
             "broker": None
-            if self._inside.mqtt is None
+            if self._web_context.mqtt is None
             else f"{config.mqtt.host}:{config.mqtt.port}",
             "fov_rad": 2 * lens.max_theta_rad,
-            "heading_deg": self._inside.judge.viewpoint.camera.heading_deg,
+            "heading_deg": self._web_context.track_and_decide.ground_mapper.camera.heading_deg,
             "range_m": config.tracking.max_range_m,
         }
 
@@ -151,8 +154,8 @@ class LivePage:
     def _encode_status(self, now_s: float) -> bytes:
         """Health and broker as JSON, made once a second for all pages."""
         if now_s - self._status[0] >= 0.9 * STATUS_S:
-            mqtt = None if self._inside.mqtt is None else self._inside.mqtt()
-            status = {"health": self._inside.health(), "mqtt": mqtt}
+            mqtt = None if self._web_context.mqtt is None else self._web_context.mqtt()
+            status = {"health": self._web_context.health(), "mqtt": mqtt}
             self._status = (now_s, msgspec.json.encode(status))
         return self._status[1]
 

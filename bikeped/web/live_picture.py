@@ -20,10 +20,10 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.errors import CaptureError
 from bikeped.overlay import OverlayData, draw_overlay, encode_jpeg, ground_projector
-from bikeped.pipeline.loop import Outcome
-from bikeped.pipeline.rate_limited_log import Seldom
-from bikeped.pipeline.track_and_decide import Judge
-from bikeped.pipeline.worker_threads import Worker
+from bikeped.pipeline.loop import FrameResult
+from bikeped.pipeline.rate_limited_log import RateLimitedLogger
+from bikeped.pipeline.track_and_decide import TrackAndDecide
+from bikeped.pipeline.worker_threads import WorkerThread
 from bikeped.types import FloatArray, ImageArray, Signal
 from bikeped.web.live_state import LiveState
 
@@ -36,12 +36,14 @@ _QUALITY = 80
 class PictureRenderer:
     """Pictures of `state`'s frames as JPEG, at most `fps` a second and `width` wide."""
 
-    def __init__(self, state: LiveState, judge: Judge, width: int, fps: float) -> None:
-        self._state, self._judge = state, judge
+    def __init__(
+        self, state: LiveState, track_and_decide: TrackAndDecide, width: int, fps: float
+    ) -> None:
+        self._state, self._track_and_decide = state, track_and_decide
         self._width, self._interval_s = width, 1.0 / fps
         self._lookers = 0
         self._painting: asyncio.Task[None] | None = None
-        self._seldom = Seldom(log)
+        self._limited_log = RateLimitedLogger(log)
         self._fresh = asyncio.Event()
         self.jpeg: bytes | None = None
         self.number = 0  #: of the picture in `jpeg`
@@ -79,22 +81,22 @@ class PictureRenderer:
         self._fresh = asyncio.Event()
 
     async def _paint(self) -> None:
-        worker, decoder = Worker("paint"), JpegDecoder(buffers=1)
+        worker, decoder = WorkerThread("paint"), JpegDecoder(buffers=1)
         worker.submit(_step_back)
         frames = -1
         try:
             while not self._state.closed:
                 await self._state.next_frame(frames)
-                frames, outcome = self._state.frames, self._state.outcome
-                if outcome is None:
+                frames, result = self._state.frames, self._state.result
+                if result is None:
                     continue
                 began_s = time.monotonic()
                 try:
                     self.jpeg = await worker.submit(
-                        self._draw, decoder, outcome, self._state.signal_now, self._trails()
+                        self._draw, decoder, result, self._state.signal_now, self._trails()
                     )
                 except Exception as error:  # noqa: BLE001 - a picture less, never more
-                    self._seldom.failure("paint", error)
+                    self._limited_log.failure("paint", error)
                 else:
                     self.number += 1
                     self.drawn += 1
@@ -105,41 +107,46 @@ class PictureRenderer:
             await asyncio.shield(worker.close(0.0))
 
     def _trails(self) -> Mapping[int, FloatArray]:
-        return {key: np.asarray(value) for key, value in self._judge.tracker.history().items()}
+        return {
+            key: np.asarray(value)
+            for key, value in self._track_and_decide.tracker.history().items()
+        }
 
     def _draw(
         self,
         decoder: JpegDecoder,
-        outcome: Outcome,
+        result: FrameResult,
         signal: Signal | None,
         history: Mapping[int, FloatArray],
     ) -> bytes:
-        frame, judgement = outcome.picture.frame, outcome.judgement
+        frame, tracking = result.picture.frame, result.tracking
         overlay_data = OverlayData(
-            detections=outcome.detections,
-            tracks=judgement.tracks,
-            decision=judgement.decision,
+            detections=result.detections,
+            tracks=tracking.tracks,
+            decision=tracking.decision,
             frame_number=frame.number,
-            time_s=outcome.t_s,
+            time_s=result.t_s,
             signal=signal,
-            latency_s=outcome.latency_ms["total"] / 1e3,
+            latency_s=result.latency_ms["total"] / 1e3,
             history=history,
         )
-        small = self._picture(decoder, outcome)
-        framing = self._judge.viewpoint.framing_of(frame.width, frame.height)
+        small = self._picture(decoder, result)
+        framing = self._track_and_decide.ground_mapper.framing_for(frame.width, frame.height)
         return encode_jpeg(
             draw_overlay(
                 small,
                 overlay_data,
                 scale=small.shape[1] / frame.width,
-                ground_to_frame=ground_projector(self._judge.viewpoint.camera, framing),
+                ground_to_frame=ground_projector(
+                    self._track_and_decide.ground_mapper.camera, framing
+                ),
                 banner=False,
             ),
             _QUALITY,
         )
 
-    def _picture(self, decoder: JpegDecoder, outcome: Outcome) -> ImageArray:
-        frame = outcome.picture.frame
+    def _picture(self, decoder: JpegDecoder, result: FrameResult) -> ImageArray:
+        frame = result.picture.frame
         width = min(self._width, frame.width)
         height = max(1, round(frame.height * width / frame.width))
         if frame.jpeg is not None:

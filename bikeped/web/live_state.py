@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from bikeped.faults import fault_texts
-from bikeped.pipeline.loop import Outcome
+from bikeped.pipeline.loop import FrameResult
 from bikeped.telemetry.latency import STAGES
 from bikeped.types import Decision, Kind, PairMetrics, Signal, State
 
@@ -95,7 +95,7 @@ class LiveState:
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
         self._clock, self._wall = clock, wall_clock
-        self.outcome: Outcome | None = None
+        self.result: FrameResult | None = None
         self.signal_now: Signal | None = None
         self.number = 0  #: grows with every piece of news
         self.frames = 0  #: grows with every frame
@@ -111,15 +111,15 @@ class LiveState:
         self._collected: list[Mapping[str, float]] = []
         self._news = asyncio.Event()
 
-    async def frame(self, outcome: Outcome) -> None:
-        self.outcome = outcome
+    async def on_frame_result(self, result: FrameResult) -> None:
+        self.result = result
         self._frame_s = self._clock()
         self.frames += 1
-        self._count_latency(outcome)
-        self._follow_alert(outcome)
+        self._count_latency(result)
+        self._follow_alert(result)
         self._tell()
 
-    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+    def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
         self.signal_now, self._sentence, self._decision = signal, sentence, decision
         self._signal_s = self._clock()
         self._tell()
@@ -145,7 +145,7 @@ class LiveState:
 
     def snapshot(self) -> LiveSnapshot:
         """Everything that a page shows of this moment."""
-        signal, outcome, now_s = self.signal_now, self.outcome, self._clock()
+        signal, result, now_s = self.signal_now, self.result, self._clock()
         decision = self._decision
         return LiveSnapshot(
             number=self.number,
@@ -156,11 +156,11 @@ class LiveState:
             decided=None if decision is None else decision.state.name,
             faults=() if signal is None else fault_texts(signal.faults),
             signal_age_s=None if self._signal_s is None else now_s - self._signal_s,
-            frame=None if outcome is None else outcome.picture.frame.number,
+            frame=None if result is None else result.picture.frame.number,
             frame_age_s=None if self._frame_s is None else now_s - self._frame_s,
-            t_s=None if outcome is None else outcome.t_s,
-            pair=None if outcome is None else _pair(outcome.judgement.decision.pair),
-            tracks=() if outcome is None else _tracks(outcome),
+            t_s=None if result is None else result.t_s,
+            pair=None if result is None else _pair(result.tracking.decision.pair),
+            tracks=() if result is None else _tracks(result),
         )
 
     def _tell(self) -> None:
@@ -168,8 +168,8 @@ class LiveState:
         self._news.set()
         self._news = asyncio.Event()
 
-    def _follow_alert(self, outcome: Outcome) -> None:
-        decision = outcome.judgement.decision
+    def _follow_alert(self, result: FrameResult) -> None:
+        decision = result.tracking.decision
         last = self.alerts[-1] if self.alerts else None
         going_on = last is not None and last.ended_unix_s is None
         if decision.state is not State.ALERT:
@@ -195,14 +195,14 @@ class LiveState:
         if pair is not None and (last.nearest_m is None or pair.distance_m < last.nearest_m):
             last.nearest_m = pair.distance_m
 
-    def _count_latency(self, outcome: Outcome) -> None:
+    def _count_latency(self, result: FrameResult) -> None:
         wall_s = self._wall()
         second = int(wall_s)
         if self._second is not None and second != self._second and self._collected:
             self.trend.append(_trend_point(self._second, self._collected))
             self._collected = []
         self._second = second
-        self._collected.append(outcome.latency_ms)
+        self._collected.append(result.latency_ms)
 
 
 def _trend_point(second: int, rows: list[Mapping[str, float]]) -> TrendPoint:
@@ -236,8 +236,8 @@ def _pair(pair: PairMetrics | None) -> SeenPair | None:
     )
 
 
-def _tracks(outcome: Outcome) -> tuple[SeenTrack, ...]:
-    tracks = outcome.judgement.tracks
+def _tracks(result: FrameResult) -> tuple[SeenTrack, ...]:
+    tracks = result.tracking.tracks
     rows = zip(
         tracks.id.tolist(),
         tracks.kind.tolist(),

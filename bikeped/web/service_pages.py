@@ -7,9 +7,9 @@ from functools import partial
 from aiohttp import web
 
 from bikeped.config import LoadedConfig
-from bikeped.pipeline.loop import Outcome
+from bikeped.pipeline.loop import FrameResult
 from bikeped.pipeline.telemetry import to_mapping
-from bikeped.pipeline.web_context import Inside
+from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.http_server import add_monitoring
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align
@@ -29,21 +29,21 @@ class ServicePages:
         self._access = load_access_policy(loaded.config.web, loaded.base_dir, loaded.source)
         self.state = LiveState()
 
-    async def frame(self, outcome: Outcome) -> None:
-        await self.state.frame(outcome)
+    async def on_frame_result(self, result: FrameResult) -> None:
+        await self.state.on_frame_result(result)
 
-    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
-        self.state.signal(signal, sentence, decision)
+    def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+        self.state.on_signal(signal, sentence, decision)
 
-    def application(self, inside: Inside) -> web.Application:
+    def application(self, web_context: WebContext) -> web.Application:
         app = make_application(
             self._access,
-            partial(add_live, live=LivePage(self.state, inside)),
-            partial(add_align, loaded=inside.loaded, frame=self.newest),
+            partial(add_live, live=LivePage(self.state, web_context)),
+            partial(add_align, loaded=web_context.loaded, frame=self.newest),
         )
-        add_monitoring(app, inside.metrics, lambda: to_mapping(inside.health()))
+        add_monitoring(app, web_context.metrics, lambda: to_mapping(web_context.health()))
         return app
 
     def newest(self) -> Frame | None:
         """The newest frame that was judged."""
-        return None if self.state.outcome is None else self.state.outcome.picture.frame
+        return None if self.state.result is None else self.state.result.picture.frame

@@ -38,12 +38,12 @@ agents:
 """
 
 
-class _Eye:
+class _ClipDetector:
     """Reads the boxes of what was drawn; late in the clip it waits until the picture is taken."""
 
     name = "none: the boxes of what was drawn"
     model_hash: str | None = None
-    riders_whole = True
+    cyclist_box_includes_rider = True
 
     def __init__(self, clip: Path) -> None:
         self._frames = read_sidecar(sidecar_path(clip)).frames
@@ -52,7 +52,7 @@ class _Eye:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return min(width, 640), min(height, 640)
 
-    def see(self, picture: Any) -> DetectorAnswer:
+    def detect(self, picture: Any) -> DetectorAnswer:
         number = picture.frame.number
         self.done.wait(1.2 if number > LATE else 0.05)
         shown = [item for item in self._frames[number] if item.visible > 0.3]
@@ -68,13 +68,18 @@ class _Showing:
     """One replay with its pages, in a thread."""
 
     def __init__(self, loaded: LoadedConfig, clip: Path) -> None:
-        self.eye = _Eye(clip)
+        self.detector = _ClipDetector(clip)
         self.url = ""
         self._known = threading.Event()
         pages = ServicePages(loaded)
         self._thread = threading.Thread(
             target=lambda: replay(
-                loaded, str(clip), eye=self.eye, mqtt=False, pages=pages, serving=self._heard
+                loaded,
+                str(clip),
+                detector=self.detector,
+                mqtt=False,
+                pages=pages,
+                serving=self._heard,
             ),
             daemon=True,
         )
@@ -86,7 +91,7 @@ class _Showing:
         self._known.set()
 
     def end(self) -> None:
-        self.eye.done.set()
+        self.detector.done.set()
         self._thread.join()
 
 

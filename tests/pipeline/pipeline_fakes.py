@@ -1,4 +1,4 @@
-"""Fakes at the seams of the loop: a feed, an eye, a light, a clock, and one who listens."""
+"""Fakes at the seams of the loop: a feed, an detector, a light, a clock, and one who listens."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from bikeped.config import LoadedConfig, parse_config
 from bikeped.detection.base import DetectorAnswer
 from bikeped.faults import fault_texts
 from bikeped.feedback import SignalLogic
-from bikeped.pipeline.detection_stage import Picture, Vision
-from bikeped.pipeline.loop import Limits, Loop, Outcome
-from bikeped.pipeline.signal_dispatcher import Announcer
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.detection_stage import DetectionStage, Picture
+from bikeped.pipeline.loop import FrameResult, Limits, Loop
+from bikeped.pipeline.signal_dispatcher import SignalDispatcher
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Decision, Detections, Frame, Kind, Signal
 
 PATIENCE_S = 20.0  # reached only by a failure
@@ -95,12 +95,12 @@ class FakeFeed:
         self.closed = True
 
 
-class FakeEye:
+class FakeDetector:
     """Sees `answer`; raises `error` while there is one; blocks while `go` is not set."""
 
     name = "fake"
     model_hash: str | None = None
-    riders_whole = False
+    cyclist_box_includes_rider = False
 
     def __init__(self, answer: Detections | None = None) -> None:
         self.answer = Detections.empty() if answer is None else answer
@@ -108,13 +108,13 @@ class FakeEye:
         self.go = threading.Event()
         self.go.set()
         self.entered = threading.Event()
-        self.looks = 0
+        self.calls = 0
 
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return width, height
 
-    def see(self, picture: Picture) -> DetectorAnswer:
-        self.looks += 1
+    def detect(self, picture: Picture) -> DetectorAnswer:
+        self.calls += 1
         self.entered.set()
         self.go.wait(PATIENCE_S)
         if self.error is not None:
@@ -133,20 +133,20 @@ class FakeLight:
 
 
 class Recorder:
-    """Listens to signals, outcomes and ticks, and lets a test wait for them."""
+    """Listens to signals, results and ticks, and lets a test wait for them."""
 
     def __init__(self) -> None:
         self.signals: list[tuple[Signal, str, Decision | None]] = []
-        self.outcomes: list[Outcome] = []
+        self.results: list[FrameResult] = []
         self.ticks = 0
         self._news = asyncio.Event()
 
-    def signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
+    def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
         self.signals.append((signal, sentence, decision))
         self._news.set()
 
-    async def frame(self, outcome: Outcome) -> None:
-        self.outcomes.append(outcome)
+    async def on_frame_result(self, result: FrameResult) -> None:
+        self.results.append(result)
         self._news.set()
 
     def tick(self) -> None:
@@ -182,30 +182,30 @@ class Rig:
         self.config = config or small()
         self.clock = Clock()
         self.feed = FakeFeed(live)
-        self.eye = FakeEye()
+        self.detector = FakeDetector()
         self.light = FakeLight()
         self.recorder = Recorder()
         self.outputs: list[object] = [self.recorder]
         self.limits = Limits(tick_s=0.005, close_s=0.05)
-        self.judge = Judge(self.config)
-        self.looks_at_once = 1
+        self.track_and_decide = TrackAndDecide(self.config)
+        self.max_inflight = 1
 
     def start(self) -> None:
-        self.announcer = Announcer(
+        self.dispatcher = SignalDispatcher(
             SignalLogic.from_config(self.config.config.feedback),
             self.light,  # type: ignore[arg-type]
             listeners=(self.recorder,),
         )
         self.loop = Loop(
             feed=self.feed,
-            vision=Vision(self.eye),
-            judge=self.judge,
-            announcer=self.announcer,
+            detection=DetectionStage(self.detector),
+            track_and_decide=self.track_and_decide,
+            dispatcher=self.dispatcher,
             outputs=self.outputs,  # type: ignore[arg-type]
             limits=self.limits,
             clock=self.clock,
             on_tick=self.recorder.tick,
-            looks_at_once=self.looks_at_once,
+            max_inflight=self.max_inflight,
         )
         self.task = asyncio.create_task(self.loop.run())
 
@@ -214,7 +214,7 @@ class Rig:
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        self.eye.go.set()
+        self.detector.go.set()
         self.task.cancel()
         await asyncio.gather(self.task, return_exceptions=True)
 

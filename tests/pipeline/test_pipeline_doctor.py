@@ -133,12 +133,12 @@ def test_a_slow_model_is_a_warning_and_a_missing_one_fails(small_config, monkeyp
         def decode_size(self, width, height):
             return width, height
 
-        def see(self, picture):
+        def detect(self, picture):
             clock[0] += 0.05
 
     clock = [0.0]
     monkeypatch.setattr(doctor.time, "perf_counter", lambda: clock[0])
-    monkeypatch.setattr(doctor, "load_eye", lambda loaded: Slow())
+    monkeypatch.setattr(doctor, "load_detector_pool", lambda loaded: Slow())
     finding = doctor.check_model(load_config(small_config()))
     assert finding.status == "warn"
     assert finding.detail.startswith("slow: 50.0 ms a frame")

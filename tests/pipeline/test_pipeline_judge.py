@@ -1,4 +1,4 @@
-"""The judge: from detections to a decision, as the pole and a replay have it."""
+"""The track_and_decide: from detections to a decision, as the pole and a replay have it."""
 
 from __future__ import annotations
 
@@ -6,53 +6,55 @@ import numpy as np
 import pytest
 
 from bikeped.config import load_config
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Detections, GroundPoints, Kind, State
 
 P, C = Kind.PEDESTRIAN, Kind.CYCLIST
 
 
-def kinds_of_a_walker_first_taken_for_a_cyclist(judge: Judge) -> set[int]:
+def kinds_of_a_walker_first_taken_for_a_cyclist(track_and_decide: TrackAndDecide) -> set[int]:
     """What the tracks are called at the end: ten frames a cyclist, ten a pedestrian."""
     box = np.array([[1880.0, 1500.0, 1960.0, 1800.0]], np.float32)
     for frame in range(20):
         kind = Kind.CYCLIST if frame < 10 else Kind.PEDESTRIAN
         seen = Detections(np.array([kind], np.int8), np.array([0.9], np.float32), box)
-        judgement = judge.judge(seen, 3840, 2160, frame / 30, 0.0)
-        assert judgement.not_on_ground == 0
-    tracks = judgement.tracks
+        tracking = track_and_decide.update(seen, 3840, 2160, frame / 30, 0.0)
+        assert tracking.not_on_ground == 0
+    tracks = tracking.tracks
     return {int(tracks.kind[i]) for i in range(len(tracks.kind))}
 
 
-@pytest.mark.parametrize(("riders_whole", "expected"), [(False, C), (True, P)])
-def test_only_where_bicycles_are_easily_missed_a_person_stays_on_one(riders_whole, expected):
-    judge = Judge(load_config(None), riders_whole=riders_whole)
+@pytest.mark.parametrize(("cyclist_box_includes_rider", "expected"), [(False, C), (True, P)])
+def test_only_where_bicycles_are_easily_missed_a_person_stays_on_one(
+    cyclist_box_includes_rider, expected
+):
+    track_and_decide = TrackAndDecide(
+        load_config(None), cyclist_box_includes_rider=cyclist_box_includes_rider
+    )
     for _ in range(2):  # nothing of the first round is left in the second
-        judge.reset()
-        assert kinds_of_a_walker_first_taken_for_a_cyclist(judge) == {expected}
+        track_and_decide.reset()
+        assert kinds_of_a_walker_first_taken_for_a_cyclist(track_and_decide) == {expected}
 
 
 @pytest.mark.parametrize("wrong", [P, C])
 def test_one_wrong_first_sight_starts_no_memory_of_a_cyclist(wrong):
     """Two sights make a track; when they differ, the newer one is right."""
-    judge = Judge(load_config(None), riders_whole=True)
+    track_and_decide = TrackAndDecide(load_config(None), cyclist_box_includes_rider=True)
     right = P if wrong is C else C
     box = np.array([[1880.0, 1500.0, 1960.0, 1800.0]], np.float32)
     for frame in range(20):
         kind = np.array([wrong if frame == 0 else right], np.int8)
         seen = Detections(kind, np.array([0.9], np.float32), box)
-        judgement = judge.judge(seen, 3840, 2160, frame / 30, 0.0)
-        assert set(judgement.tracks.kind.tolist()) <= {right}
-        assert judgement.decision.state in (
-            {State.IDLE, State.SAFE} if right is P else {State.IDLE}
-        )
+        tracking = track_and_decide.update(seen, 3840, 2160, frame / 30, 0.0)
+        assert set(tracking.tracks.kind.tolist()) <= {right}
+        assert tracking.decision.state in ({State.IDLE, State.SAFE} if right is P else {State.IDLE})
 
 
 def test_a_reset_forgets_what_was_seen():
-    judge = Judge(load_config(None))
-    kinds_of_a_walker_first_taken_for_a_cyclist(judge)
-    judge.reset()
-    tracks = judge.judge(Detections.empty(), 3840, 2160, 0.0, 0.0).tracks
+    track_and_decide = TrackAndDecide(load_config(None))
+    kinds_of_a_walker_first_taken_for_a_cyclist(track_and_decide)
+    track_and_decide.reset()
+    tracks = track_and_decide.update(Detections.empty(), 3840, 2160, 0.0, 0.0).tracks
     assert len(tracks) == 0
 
 
@@ -73,19 +75,21 @@ def test_the_rule_is_asked_about_the_place_ahead_by_age_and_offset_up_to_the_bou
     monkeypatch, latency, age_s, ahead_s
 ):
     """A cyclist at a steady speed: how far the rule's position is ahead of the track's."""
-    judge = Judge(load_config(None, overrides=[f"latency.{setting}" for setting in latency]))
+    track_and_decide = TrackAndDecide(
+        load_config(None, overrides=[f"latency.{setting}" for setting in latency])
+    )
     asked = []
-    decide = judge._decider.step
+    decide = track_and_decide._decider.decide
 
     def watched(captured_s, number, kind, xy_m):
         asked.append(xy_m)
         return decide(captured_s, number, kind, xy_m)
 
-    monkeypatch.setattr(judge._decider, "step", watched)
+    monkeypatch.setattr(track_and_decide._decider, "decide", watched)
     for frame in range(90):
         points = GroundPoints(
             np.array([C], np.int8), np.array([[10.0, 4.0 * frame / 30]]), np.array([0])
         )
-        judgement = judge.judge_points(points, frame / 30, age_s)
-    gap_m = asked[-1][0] - judgement.tracks.xy_m[0]
+        tracking = track_and_decide.update_from_points(points, frame / 30, age_s)
+    gap_m = asked[-1][0] - tracking.tracks.xy_m[0]
     assert gap_m == pytest.approx([0.0, 4.0 * ahead_s], abs=0.02)

@@ -7,14 +7,14 @@ import threading
 
 import numpy as np
 import pytest
-from pipeline_fakes import PATIENCE_S, FakeEye, Rig, seen, small
+from pipeline_fakes import PATIENCE_S, FakeDetector, Rig, seen, small
 
 import bikeped.pipeline.loop as loop_module
 from bikeped.detection.base import DetectorAnswer
 from bikeped.errors import CaptureError, DetectorError, GeometryError
 from bikeped.pipeline.detection_stage import Picture
-from bikeped.pipeline.latest_frame_slot import Slot
-from bikeped.pipeline.loop import RESTART_AFTER_S, Hung, Limits, Outcome
+from bikeped.pipeline.latest_frame_slot import LatestFrameSlot
+from bikeped.pipeline.loop import RESTART_AFTER_S, FrameResult, Limits, StageHangError
 from bikeped.types import Colour, Kind
 
 REASSURING = {Colour.BLUE, Colour.GREEN}
@@ -69,10 +69,10 @@ async def test_nothing_is_reassuring_before_the_first_good_frames():
 async def test_a_blocked_detector_is_a_fault_and_then_the_end():
     async with Rig() as rig:
         await rig.well()
-        rig.eye.go.clear()
-        rig.eye.entered.clear()
+        rig.detector.go.clear()
+        rig.detector.entered.clear()
         rig.feed.put(rig.clock.now_s + 0.03)
-        assert await asyncio.to_thread(rig.eye.entered.wait, PATIENCE_S)
+        assert await asyncio.to_thread(rig.detector.entered.wait, PATIENCE_S)
         rig.clock.now_s += 0.6
         rig.feed.last_s = rig.clock.now_s  # the camera goes on
         await rig.recorder.some_ticks()
@@ -80,7 +80,7 @@ async def test_a_blocked_detector_is_a_fault_and_then_the_end():
         assert rig.recorder.faults == ("detector: no answer for more than 0.5 s",)
         rig.clock.now_s += 15.1
         rig.feed.last_s = rig.clock.now_s
-        with pytest.raises(Hung, match="detector: has not returned for 15 s"):
+        with pytest.raises(StageHangError, match="detector: has not returned for 15 s"):
             await rig.ended()
         assert rig.feed.closed
         assert rig.light.shown[-1].name == "FAULT"
@@ -91,7 +91,7 @@ async def test_a_read_that_does_not_return_is_the_end():
     async with Rig() as rig:
         await rig.well()
         rig.feed.hang_s = 15.1
-        with pytest.raises(Hung, match="camera: a read has not returned"):
+        with pytest.raises(StageHangError, match="camera: a read has not returned"):
             await rig.ended()
         assert rig.light.shown[-1].name == "FAULT"
 
@@ -100,9 +100,9 @@ async def test_a_read_that_does_not_return_is_the_end():
 async def test_one_failure_of_the_detector_costs_one_frame(error):
     async with Rig() as rig:
         await rig.well()
-        rig.eye.error = error
+        rig.detector.error = error
         await rig.frames(1)
-        rig.eye.error = None
+        rig.detector.error = None
         await rig.frames(1)
         assert rig.recorder.name == "IDLE"
         assert (rig.loop.counts.failed, rig.loop.counts.frames) == (1, 7)
@@ -111,18 +111,18 @@ async def test_one_failure_of_the_detector_costs_one_frame(error):
 async def test_a_detector_that_only_fails_is_a_fault_that_says_why_and_then_the_end():
     async with Rig() as rig:
         await rig.well()
-        rig.eye.error = DetectorError("device lost")
+        rig.detector.error = DetectorError("device lost")
         await rig.frames(20)
         await rig.recorder.some_ticks()
         assert rig.recorder.name == "FAULT"
         assert "detector: device lost" in rig.recorder.faults
-        rig.eye.error = None
+        rig.detector.error = None
         await rig.frames(5)
         assert rig.recorder.name == "IDLE"
-        rig.eye.error = DetectorError("device lost")
+        rig.detector.error = DetectorError("device lost")
         await rig.frames(1)
         rig.clock.now_s += 15.1
-        with pytest.raises(Hung, match="device lost"):
+        with pytest.raises(StageHangError, match="device lost"):
             await rig.ended()
 
 
@@ -162,7 +162,7 @@ async def test_frames_of_other_proportions_are_a_fault():
         rig.feed.put(rig.clock.now_s, width=96, height=96)
         await rig.recorder.until(lambda: rig.recorder.name == "FAULT")
         assert any(line.startswith("geometry: camera.width") for line in rig.recorder.faults)
-        assert rig.eye.looks == 6  # what cannot be placed is not looked at
+        assert rig.detector.calls == 6  # what cannot be placed is not looked at
         await rig.frames(5)
         assert rig.recorder.name == "IDLE"
 
@@ -177,7 +177,7 @@ async def test_frames_of_other_proportions_end_a_replay():
 async def test_a_time_that_goes_back_is_counted_and_becomes_a_fault():
     async with Rig() as rig:
         await rig.well()
-        tracks = rig.recorder.outcomes[-1].judgement.tracks.time_s
+        tracks = rig.recorder.results[-1].tracking.tracks.time_s
         for n in range(20):
             rig.clock.now_s += 1 / 30
             rig.feed.put(tracks - 50 + n / 30)
@@ -198,10 +198,10 @@ async def test_a_camera_error_is_told_and_is_a_fault_at_once():
 
 
 class Broken:
-    async def frame(self, outcome):
+    async def on_frame_result(self, result):
         raise OSError("the disk is full")
 
-    def signal(self, signal, sentence, decision):
+    def on_signal(self, signal, sentence, decision):
         raise OSError("the disk is full")
 
 
@@ -209,9 +209,9 @@ async def test_an_output_that_fails_does_not_end_a_live_loop():
     rig = Rig()
     rig.outputs.insert(0, Broken())
     async with rig:
-        rig.announcer._listeners = (Broken(), rig.recorder)
+        rig.dispatcher._listeners = (Broken(), rig.recorder)
         await rig.well()
-        assert len(rig.recorder.outcomes) == 6
+        assert len(rig.recorder.results) == 6
 
 
 async def test_an_output_that_fails_ends_a_replay():
@@ -236,13 +236,13 @@ async def test_stopping_during_a_blocked_read_is_prompt_and_dark():
 async def test_stopping_while_the_detector_hangs_leaves_it_behind():
     async with Rig() as rig:
         await rig.well()
-        rig.eye.go.clear()
-        rig.eye.entered.clear()
+        rig.detector.go.clear()
+        rig.detector.entered.clear()
         rig.feed.put(rig.clock.now_s + 0.03)
-        assert await asyncio.to_thread(rig.eye.entered.wait, PATIENCE_S)
+        assert await asyncio.to_thread(rig.detector.entered.wait, PATIENCE_S)
         rig.loop.stop()
         await rig.ended()
-        assert not rig.eye.go.is_set()
+        assert not rig.detector.go.is_set()
         assert rig.light.shown[-1].name == "OFF"
 
 
@@ -271,11 +271,11 @@ async def test_a_recording_ends_the_loop_after_its_last_frame():
     async with Rig(live=False) as rig:
         rig.recorded(10)
         await rig.ended()
-        assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(10))
+        assert [o.picture.frame.number for o in rig.recorder.results] == list(range(10))
         assert rig.recorder.ticks == 0  # a recording is not late
 
 
-class PatientEye(FakeEye):
+class PatientDetector(FakeDetector):
     """Answers about a frame when the next one (or the end) waits in the slot."""
 
     def __init__(self) -> None:
@@ -283,8 +283,8 @@ class PatientEye(FakeEye):
         self.put = 0
         self.changed = threading.Condition()
 
-    def see(self, picture: Picture) -> DetectorAnswer:
-        answer = super().see(picture)
+    def detect(self, picture: Picture) -> DetectorAnswer:
+        answer = super().detect(picture)
         with self.changed:
             assert self.changed.wait_for(lambda: self.put >= picture.frame.number + 2, PATIENCE_S)
         return answer
@@ -292,27 +292,27 @@ class PatientEye(FakeEye):
 
 async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
     rig = Rig(live=False)
-    rig.eye = eye = PatientEye()
+    rig.detector = detector = PatientDetector()
     judged: list[int] = []
 
-    class Watched(Slot):
+    class Watched(LatestFrameSlot):
         def put(self, item: Picture | None) -> None:
             super().put(item)
-            with eye.changed:
-                eye.put += 1
-                eye.changed.notify_all()
+            with detector.changed:
+                detector.put += 1
+                detector.changed.notify_all()
 
     class Output:
-        """Takes an outcome only when the eye has begun with the next frame."""
+        """Takes an result only when the detector has begun with the next frame."""
 
-        async def frame(self, outcome: Outcome) -> None:
-            judged.append(outcome.picture.frame.number)
+        async def on_frame_result(self, result: FrameResult) -> None:
+            judged.append(result.picture.frame.number)
             deadline = asyncio.get_running_loop().time() + PATIENCE_S
-            while judged[-1] < 9 and eye.looks < judged[-1] + 2:
+            while judged[-1] < 9 and detector.calls < judged[-1] + 2:
                 assert asyncio.get_running_loop().time() < deadline
                 await asyncio.sleep(0)
 
-    monkeypatch.setattr(loop_module, "Slot", Watched)
+    monkeypatch.setattr(loop_module, "LatestFrameSlot", Watched)
     rig.outputs.append(Output())
     rig.recorded(10)
     async with rig:
@@ -320,7 +320,7 @@ async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
     assert judged == list(range(10))
 
 
-class PairedEye(FakeEye):
+class PairedDetector(FakeDetector):
     """Answers only when two look at once, about the later frame first."""
 
     def __init__(self) -> None:
@@ -328,7 +328,7 @@ class PairedEye(FakeEye):
         self.both = threading.Barrier(2, timeout=PATIENCE_S)
         self.later = threading.Event()
 
-    def see(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectorAnswer:
         self.both.wait()
         if picture.frame.number % 2:
             self.later.set()
@@ -343,25 +343,25 @@ class PairedEye(FakeEye):
 @pytest.mark.parametrize("count", [8, 10])
 async def test_two_looks_at_once_are_judged_in_order(count):
     rig = Rig(live=False)
-    rig.eye = PairedEye()
-    rig.looks_at_once = 2
+    rig.detector = PairedDetector()
+    rig.max_inflight = 2
     rig.recorded(count)
     async with rig:
         await rig.ended()
-    assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(count))
+    assert [o.picture.frame.number for o in rig.recorder.results] == list(range(count))
 
 
 async def test_the_second_of_two_looks_fails_after_the_first_is_judged():
     rig = Rig(live=False)
-    rig.eye = PairedEye()
-    rig.eye.error = DetectorError("out of memory")
-    rig.looks_at_once = 2
+    rig.detector = PairedDetector()
+    rig.detector.error = DetectorError("out of memory")
+    rig.max_inflight = 2
     rig.recorded(10, ends=False)
     async with rig:
         with pytest.raises(DetectorError, match="out of memory"):
             await rig.ended()
-        rig.eye.both.abort()  # whoever looks now
-    assert [o.picture.frame.number for o in rig.recorder.outcomes] == [0, 1, 2, 3, 4]
+        rig.detector.both.abort()  # whoever looks now
+    assert [o.picture.frame.number for o in rig.recorder.results] == [0, 1, 2, 3, 4]
 
 
 async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
@@ -369,10 +369,10 @@ async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
     judged: list[int] = []
 
     class Output:
-        async def frame(self, outcome: Outcome) -> None:
-            judged.append(outcome.picture.frame.number)
+        async def on_frame_result(self, result: FrameResult) -> None:
+            judged.append(result.picture.frame.number)
             if len(judged) == 3:
-                rig.eye.error = DetectorError("out of memory")
+                rig.detector.error = DetectorError("out of memory")
 
     rig.outputs.append(Output())
     rig.recorded(10, ends=False)
@@ -386,21 +386,21 @@ async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
 @pytest.mark.parametrize("looks", [1, 2])
 async def test_frames_before_one_of_other_proportions_are_judged(looks):
     rig = Rig(live=False)
-    rig.looks_at_once = looks
+    rig.max_inflight = looks
     rig.recorded(6, ends=False)
     rig.feed.put(6 / 30, width=64, height=96, rgb=np.zeros((96, 64, 3), np.uint8))
     async with rig:
         with pytest.raises(GeometryError):
             await rig.ended()
-    assert [o.picture.frame.number for o in rig.recorder.outcomes] == list(range(6))
+    assert [o.picture.frame.number for o in rig.recorder.results] == list(range(6))
 
 
 async def test_an_output_that_fails_while_the_eye_hangs_ends_a_replay():
     rig = Rig(live=False)
 
     class Output:
-        async def frame(self, outcome: Outcome) -> None:
-            rig.eye.go.clear()
+        async def on_frame_result(self, result: FrameResult) -> None:
+            rig.detector.go.clear()
             raise OSError("disk is full")
 
     rig.outputs.append(Output())
@@ -416,7 +416,7 @@ async def test_the_newest_decision_reaches_listeners_with_its_own_pair():
     async with rig:
         await rig.frames(6)
         for n in range(30):
-            rig.eye.answer = seen((Kind.PEDESTRIAN, 30, 30), (Kind.CYCLIST, 80 - n, 30))
+            rig.detector.answer = seen((Kind.PEDESTRIAN, 30, 30), (Kind.CYCLIST, 80 - n, 30))
             await rig.frames(1)
             if rig.recorder.name == "ALERT":
                 break
@@ -432,10 +432,10 @@ async def test_the_newest_decision_reaches_listeners_with_its_own_pair():
 async def test_latencies_are_the_papers_stages_and_add_up():
     async with Rig() as rig:
         await rig.well()
-        latency = rig.recorder.outcomes[-1].latency_ms
+        latency = rig.recorder.results[-1].latency_ms
         parts = ("pre", "inference", "post", "track", "decide", "feedback")
         assert set(latency) == {*parts, "acquire", "total", "capture_age"}
         assert latency["capture_age"] == pytest.approx(latency["total"] + latency["acquire"])
         assert latency["acquire"] == 1.0
-        # The fake eye claims more than it takes, by 1.2 ms.
+        # The fake detector claims more than it takes, by 1.2 ms.
         assert latency["total"] > sum(latency[p] for p in parts) - 1.3

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import jsonschema
 import numpy as np
-from pipeline_fakes import PATIENCE_S, FakeEye, seen
+from pipeline_fakes import PATIENCE_S, FakeDetector, seen
 
 from bikeped.capture import FrameSource
 from bikeped.config import load_config
@@ -53,13 +53,13 @@ class Endless(FrameSource):
             assert self._read.wait_for(lambda: self.number >= number, PATIENCE_S)
 
 
-class Walker(FakeEye):
+class Walker(FakeDetector):
     """A pedestrian who is there half of the time, so that the state changes."""
 
-    def see(self, picture):
+    def detect(self, picture):
         there = picture.frame.number // 20 % 2 == 0
         self.answer = seen(*([(Kind.PEDESTRIAN, 48, 35)] if there else []))
-        return super().see(picture)
+        return super().detect(picture)
 
 
 def check(suffix: str, payload: bytes) -> None:
@@ -83,7 +83,7 @@ async def test_a_broker_killed_in_mid_replay_costs_messages_and_no_time(
     events = tmp_path / "events.jsonl"
     running = asyncio.create_task(
         asyncio.to_thread(
-            replay, load_config(config), "endless", eye=Walker(), files=ReplayFiles(events)
+            replay, load_config(config), "endless", detector=Walker(), files=ReplayFiles(events)
         )
     )
 

@@ -1,4 +1,4 @@
-"""Worker, seldom log lines, feeds, vision: the small parts that the loop stands on."""
+"""WorkerThread, limited_log log lines, feeds, vision: the small parts that the loop stands on."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline_fakes import PATIENCE_S, Clock, FakeEye
+from pipeline_fakes import PATIENCE_S, Clock, FakeDetector
 
 from bikeped.capture import FrameGrabber, open_source
 from bikeped.errors import CaptureError
-from bikeped.pipeline.detection_stage import Vision
+from bikeped.pipeline.detection_stage import DetectionStage
 from bikeped.pipeline.feed import LiveFeed, RecordedFeed
-from bikeped.pipeline.rate_limited_log import Seldom
+from bikeped.pipeline.rate_limited_log import RateLimitedLogger
 from bikeped.pipeline.systemd import Notifier
-from bikeped.pipeline.worker_threads import Worker
+from bikeped.pipeline.worker_threads import WorkerThread
 from bikeped.types import Frame
 
 
 async def test_a_worker_answers_in_order_and_passes_errors_on():
-    worker = Worker("test")
+    worker = WorkerThread("test")
     assert await asyncio.gather(*(worker.submit(pow, n, 2) for n in range(5))) == [0, 1, 4, 9, 16]
     with pytest.raises(ZeroDivisionError):
         await worker.submit(divmod, 1, 0)
@@ -33,7 +33,7 @@ async def test_a_worker_answers_in_order_and_passes_errors_on():
 
 async def test_a_worker_that_hangs_says_so_and_is_left_behind():
     clock, go, entered = Clock(), threading.Event(), threading.Event()
-    worker = Worker("test", clock)
+    worker = WorkerThread("test", clock)
 
     def hang() -> None:
         entered.set()
@@ -54,7 +54,7 @@ async def test_a_worker_that_hangs_says_so_and_is_left_behind():
 
 
 async def test_a_cancelled_call_is_not_begun():
-    worker, go, done = Worker("test"), threading.Event(), []
+    worker, go, done = WorkerThread("test"), threading.Event(), []
     first = worker.submit(go.wait, PATIENCE_S)
     second = worker.submit(done.append, 1)
     second.cancel()
@@ -67,14 +67,14 @@ async def test_a_cancelled_call_is_not_begun():
 
 def test_thirty_failures_a_second_are_a_line_every_ten(caplog):
     clock = Clock()
-    seldom = Seldom(logging.getLogger("seldom"), clock=clock)
+    limited_log = RateLimitedLogger(logging.getLogger("limited_log"), clock=clock)
     with caplog.at_level(logging.WARNING):
         for _ in range(300):
-            seldom.warn("decode", "bad frame")
+            limited_log.warn("decode", "bad frame")
             clock.now_s += 1 / 30
-        seldom.failure("output", OSError("full"))
+        limited_log.failure("output", OSError("full"))
         clock.now_s += 0.5
-        seldom.warn("decode", "bad frame")
+        limited_log.warn("decode", "bad frame")
     assert [record.getMessage() for record in caplog.records] == [
         "bad frame",
         "output: full",
@@ -150,14 +150,14 @@ async def test_a_live_feed_that_ended_says_so_and_one_that_broke_says_why(make_c
     assert feed.error() == "/dev/video7: no such camera"
 
 
-VISION = Vision(FakeEye())
+STAGE = DetectionStage(FakeDetector())
 
 
 @given(st.binary(max_size=2000))
 @settings(max_examples=200, deadline=None)
 def test_any_bytes_as_a_frame_are_refused_and_never_crash(data):
     with pytest.raises(CaptureError):
-        VISION.decode(Frame(0, 0.0, 96, 64, jpeg=data), 0.0, 0.0)
+        STAGE.decode(Frame(0, 0.0, 96, 64, jpeg=data), 0.0, 0.0)
 
 
 @given(st.data())
@@ -167,7 +167,7 @@ def test_a_damaged_jpeg_is_a_picture_or_refused(small_jpegs, data):
     for _ in range(data.draw(st.integers(1, 8))):
         jpeg[data.draw(st.integers(0, len(jpeg) - 1))] = data.draw(st.integers(0, 255))
     try:
-        picture = VISION.decode(Frame(0, 0.0, 96, 64, jpeg=bytes(jpeg)), 0.0, 0.0)
+        picture = STAGE.decode(Frame(0, 0.0, 96, 64, jpeg=bytes(jpeg)), 0.0, 0.0)
     except CaptureError:
         return
     assert picture.rgb.dtype == np.uint8

@@ -9,7 +9,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from pipeline_fakes import FakeEye, seen
+from pipeline_fakes import FakeDetector, seen
 
 from bikeped.config import load_config
 from bikeped.errors import BikepedError, CaptureError, GeometryError, TelemetryError
@@ -18,13 +18,13 @@ from bikeped.telemetry.builders import decision_digest, decision_view, parse_eve
 from bikeped.types import Detections, Kind
 
 
-class Script(FakeEye):
+class Script(FakeDetector):
     """A cyclist rides up to a waiting pedestrian; what is seen depends on the frame alone."""
 
-    def see(self, picture):
+    def detect(self, picture):
         n = picture.frame.number
         self.answer = seen((Kind.PEDESTRIAN, 30, 30), (Kind.CYCLIST, 90 - n, 31 + n % 3))
-        return super().see(picture)
+        return super().detect(picture)
 
 
 def lines(path: Path) -> list[bytes]:
@@ -37,7 +37,7 @@ def test_two_replays_decide_the_same_byte_for_byte(make_clip, small_config, tmp_
     digests, views = set(), set()
     for run in range(2):
         events = tmp_path / f"{run}.jsonl"
-        result = replay(loaded, str(clip), eye=Script(), files=ReplayFiles(events=events))
+        result = replay(loaded, str(clip), detector=Script(), files=ReplayFiles(events=events))
         assert result.frames == 45
         found = lines(events)
         assert len(found) == 46
@@ -54,7 +54,13 @@ def test_the_realtime_replay_decides_the_same(make_clip, small_config, tmp_path)
     views = []
     for run, realtime in enumerate((False, True)):
         events = tmp_path / f"{run}.jsonl"
-        replay(loaded, str(clip), eye=Script(), files=ReplayFiles(events=events), realtime=realtime)
+        replay(
+            loaded,
+            str(clip),
+            detector=Script(),
+            files=ReplayFiles(events=events),
+            realtime=realtime,
+        )
         # Paced frames carry the clock's time: the header and `t` agree to the tenth of a ms.
         views.append([decision_view(line) for line in lines(events)][1:])
     assert views[0] == views[1]
@@ -80,7 +86,7 @@ def test_a_real_model_decodes_looks_and_says_safe(make_clip, small_config, tmp_p
 def test_junk_among_the_frames_is_counted_and_skipped(make_clip, small_config, small_jpegs):
     pictures = [small_jpegs[0], small_jpegs[1], small_jpegs[2][:300], b"\xff\xd8junk"]
     clip = make_clip("junk.avi", 20, pictures)
-    result = replay(load_config(small_config(clip)), str(clip), eye=FakeEye())
+    result = replay(load_config(small_config(clip)), str(clip), detector=FakeDetector())
     assert (result.frames, result.undecodable) == (10, 10)
 
 
@@ -93,25 +99,25 @@ def test_nothing_that_decodes_is_an_error_and_leaves_no_file(
     out.mkdir()
     files = ReplayFiles(out / "e.jsonl", out / "o.mp4")
     with pytest.raises(BikepedError, match=r"junk\.avi"):
-        replay(load_config(small_config(clip)), str(clip), eye=FakeEye(), files=files)
+        replay(load_config(small_config(clip)), str(clip), detector=FakeDetector(), files=files)
     assert list(out.iterdir()) == []
 
 
 def test_an_error_in_the_middle_leaves_no_half_written_file(
     make_clip, small_config, small_jpegs, tmp_path
 ):
-    class Fails(FakeEye):
-        def see(self, picture):
+    class Fails(FakeDetector):
+        def detect(self, picture):
             if picture.frame.number == 7:
                 raise CaptureError("the model file went away")
-            return super().see(picture)
+            return super().detect(picture)
 
     out = tmp_path / "out"
     out.mkdir()
     files = ReplayFiles(out / "e.jsonl", out / "o.mp4")
     clip = make_clip("c.avi", 10)
     with pytest.raises(CaptureError, match="went away"):
-        replay(load_config(small_config(clip)), str(clip), eye=Fails(), files=files)
+        replay(load_config(small_config(clip)), str(clip), detector=Fails(), files=files)
     assert list(out.iterdir()) == []
 
 
@@ -119,7 +125,7 @@ def test_other_proportions_are_refused_with_both_files_named(make_clip, small_co
     clip = make_clip("c.avi", 3)
     loaded = load_config(small_config(clip), ["camera.height=96"])
     with pytest.raises(GeometryError, match=r"small\.yaml.*c\.avi.*camera\.width"):
-        replay(loaded, str(clip), eye=FakeEye())
+        replay(loaded, str(clip), detector=FakeDetector())
 
 
 def test_a_scaled_copy_is_said_once_with_the_mend(make_clip, small_config, caplog):
@@ -149,8 +155,8 @@ def test_detections_in_the_sky_mean_wrong_camera_settings(make_clip, small_confi
 
 def test_a_few_in_the_sky_mean_nothing(make_clip, small_config):
     clip = make_clip("c.avi", 25)
-    eye = FakeEye(seen((Kind.PEDESTRIAN, 48, 40), (Kind.PEDESTRIAN, 40, 45)))
-    assert replay(load_config(small_config(clip)), str(clip), eye=eye).warnings == ()
+    detector = FakeDetector(seen((Kind.PEDESTRIAN, 48, 40), (Kind.PEDESTRIAN, 40, 45)))
+    assert replay(load_config(small_config(clip)), str(clip), detector=detector).warnings == ()
 
 
 def test_the_lamps_of_the_crossing_are_not_touched(make_clip, small_config, caplog):
@@ -172,7 +178,7 @@ def test_a_camera_is_no_recording(small_config, monkeypatch):
 
     monkeypatch.setattr("bikeped.pipeline.replay.open_source", lambda *a, **k: Camera())
     with pytest.raises(BikepedError, match="bikeped run"):
-        replay(load_config(small_config()), "/dev/video0", eye=FakeEye())
+        replay(load_config(small_config()), "/dev/video0", detector=FakeDetector())
 
 
 def test_without_a_model_the_key_is_named(make_clip, small_config):
@@ -182,12 +188,12 @@ def test_without_a_model_the_key_is_named(make_clip, small_config):
 
 
 def test_an_event_file_that_cannot_be_written_stops_before_the_replay(make_clip, small_config):
-    eye = FakeEye(Detections.empty())
+    detector = FakeDetector(Detections.empty())
     files = ReplayFiles(events=Path("/nowhere/e.jsonl"))
     clip = make_clip("c.avi", 3)
     with pytest.raises(TelemetryError, match="/nowhere"):
-        replay(load_config(small_config(clip)), str(clip), eye=eye, files=files)
-    assert eye.looks == 0
+        replay(load_config(small_config(clip)), str(clip), detector=detector, files=files)
+    assert detector.calls == 0
 
 
 def test_an_interrupt_ends_with_what_there_is_and_says_so(make_clip, small_config, tmp_path):
@@ -201,7 +207,7 @@ def test_an_interrupt_ends_with_what_there_is_and_says_so(make_clip, small_confi
     result = replay(
         load_config(small_config(clip)),
         str(clip),
-        eye=Script(),
+        detector=Script(),
         files=ReplayFiles(events=events),
         progress=interrupt,
     )

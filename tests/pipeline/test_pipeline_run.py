@@ -177,17 +177,17 @@ from bikeped.detection.base import DetectorAnswer
 from bikeped.types import Detections
 import bikeped.pipeline.run as run
 
-class Eye:
-    name, model_hash, riders_whole, looks = "hangs", None, False, 0
+class FrameDetector:
+    name, model_hash, cyclist_box_includes_rider, calls = "hangs", None, False, 0
     def decode_size(self, width, height):
         return width, height
-    def see(self, picture):
-        self.looks += 1
-        if self.looks > 20:
+    def detect(self, picture):
+        self.calls += 1
+        if self.calls > 20:
             threading.Event().wait()  # for ever, as a driver may
         return DetectorAnswer(Detections.empty(), 0.0, 0.0, 0.0)
 
-run.load_eye = lambda loaded: Eye()
+run.load_detector_pool = lambda loaded: FrameDetector()
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -209,7 +209,7 @@ LOADS_FOR_EVER = """
 import sys, threading
 from bikeped.cli.main import main
 import bikeped.pipeline.run as run
-run.load_eye = lambda loaded: threading.Event().wait()
+run.load_detector_pool = lambda loaded: threading.Event().wait()
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -14,7 +14,7 @@ from bikeped.errors import DetectorError
 from bikeped.faults import Fault
 from bikeped.feedback import SignalLogic
 from bikeped.pipeline.health_report import health_line, report_health
-from bikeped.pipeline.signal_dispatcher import Announcer
+from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.telemetry import Telemetry
 from bikeped.telemetry.builders import encode
 from bikeped.telemetry.metrics import Metrics
@@ -63,7 +63,7 @@ class TelemetryRig(Rig):
         self.interval = Clock(0.0)
         self.telemetry = Telemetry(
             self.config,
-            self.judge,
+            self.track_and_decide,
             publisher=self.publisher,
             audit=self.audit,
             metrics=self.metrics,
@@ -72,7 +72,7 @@ class TelemetryRig(Rig):
         )
         self.outputs = [self.telemetry, self.recorder]
         super().start()
-        self.announcer._listeners = (self.telemetry, self.recorder)
+        self.dispatcher._listeners = (self.telemetry, self.recorder)
 
     async def frames(self, count, step_s=1 / 30, **changes):
         for _ in range(count):
@@ -97,7 +97,7 @@ async def test_the_state_message_of_an_alert_has_that_frames_pair():
     async with rig:
         await rig.well()
         for n in range(30):
-            rig.eye.answer = seen((Kind.PEDESTRIAN, 30, 30), (Kind.CYCLIST, 80 - n, 30))
+            rig.detector.answer = seen((Kind.PEDESTRIAN, 30, 30), (Kind.CYCLIST, 80 - n, 30))
             await rig.frames(1)
             if rig.recorder.name == "ALERT":
                 break
@@ -113,7 +113,7 @@ async def test_the_state_message_of_an_alert_has_that_frames_pair():
 
 async def test_tracks_come_at_the_interval_with_the_time_of_capture():
     async with TelemetryRig() as rig:
-        rig.eye.answer = seen((Kind.PEDESTRIAN, 48, 35))
+        rig.detector.answer = seen((Kind.PEDESTRIAN, 48, 35))
         await rig.frames(60)
         messages = rig.publisher.of("tracks")
         assert 18 <= len(messages) <= 21  # two seconds, ten a second
@@ -195,9 +195,9 @@ async def test_every_lost_frame_is_in_health_metrics_and_log_line():
     async with TelemetryRig() as rig:
         await rig.well()
         await rig.frames(2, jpeg=b"junk")
-        rig.eye.error = DetectorError("out of memory")
+        rig.detector.error = DetectorError("out of memory")
         await rig.frames(3)
-        rig.eye.error = None
+        rig.detector.error = None
         rig.feed.put(rig.clock.now_s - 50)
         await rig.recorder.until(lambda: rig.loop.counts.out_of_order == 1)
         message = rig.telemetry.health(rig.loop, "simulated")
@@ -245,9 +245,9 @@ def test_the_announcer_refreshes_what_it_shows():
     from pipeline_fakes import FakeLight
 
     light = FakeLight()
-    announcer = Announcer(SignalLogic(), light)  # type: ignore[arg-type]
-    announcer.refresh()
+    dispatcher = SignalDispatcher(SignalLogic(), light)  # type: ignore[arg-type]
+    dispatcher.refresh()
     assert light.shown == []
-    announcer.off()
-    announcer.refresh()
+    dispatcher.off()
+    dispatcher.refresh()
     assert [signal.name for signal in light.shown] == ["OFF", "OFF"]

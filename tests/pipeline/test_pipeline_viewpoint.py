@@ -5,7 +5,7 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.errors import GeometryError
-from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.types import Detections, Kind
 
 
@@ -18,8 +18,8 @@ def standing_at(*bottom_px: tuple[float, float]) -> Detections:
 
 
 def test_points_name_the_detections_that_stand_on_the_ground_in_range():
-    view = Viewpoint(load_config(None, ["tracking.max_range_m=8"]))
-    frame = view.framing_of(3840, 2160)
+    view = GroundMapper(load_config(None, ["tracking.max_range_m=8"]))
+    frame = view.framing_for(3840, 2160)
     near, sky, far = (1920.0, 1700.0), (1920.0, 300.0), (1920.0, 1250.0)
     points, not_on_ground = view.ground(standing_at(sky, far, near), frame)
     assert points.detection.tolist() == [2]
@@ -30,15 +30,15 @@ def test_points_name_the_detections_that_stand_on_the_ground_in_range():
 
 
 def test_a_smaller_frame_of_the_same_camera_is_the_same_ground():
-    view = Viewpoint(load_config(None))
-    large, _ = view.ground(standing_at((1500.0, 1700.0)), view.framing_of(3840, 2160))
+    view = GroundMapper(load_config(None))
+    large, _ = view.ground(standing_at((1500.0, 1700.0)), view.framing_for(3840, 2160))
     half = standing_at((1500.0, 1700.0))
     half = Detections(half.kind, half.confidence, half.box_px / 2)
-    small, _ = view.ground(half, view.framing_of(1920, 1080))
+    small, _ = view.ground(half, view.framing_for(1920, 1080))
     assert small.xy_m == pytest.approx(large.xy_m, abs=1e-3)
 
 
 def test_frames_of_another_shape_are_another_cameras():
-    view = Viewpoint(load_config(None))
+    view = GroundMapper(load_config(None))
     with pytest.raises(GeometryError):
-        view.framing_of(1000, 1000)
+        view.framing_for(1000, 1000)

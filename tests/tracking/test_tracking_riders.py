@@ -20,7 +20,7 @@ SETTINGS = TrackerSettings(
     rider_radius_m=1.0,
 )
 #: Of a detector that boxes rider and cycle as one.
-WHOLE = replace(SETTINGS, riders_whole=True)
+WHOLE = replace(SETTINGS, cyclist_box_includes_rider=True)
 
 
 def feed(tracker: BatchTracker, frame: int, *detections: tuple[int, float, float]) -> None:

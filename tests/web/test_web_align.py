@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
-from web_fakes import LOCKED, OPEN, Scene, inside
+from web_fakes import LOCKED, OPEN, Scene, web_context
 
 from bikeped.config import framing, ground_camera, load_config
 from bikeped.types import Frame
@@ -240,17 +240,17 @@ async def test_another_site_can_neither_ask_nor_save(place: Path, start) -> None
 
 async def test_the_service_s_newest_frame_is_the_picture(place: Path, start) -> None:
     loaded = load_config(place, SMALL)
-    pages, within = ServicePages(loaded), inside(loaded)
+    pages, within = ServicePages(loaded), web_context(loaded)
 
     class Served:
         app = pages.application(within)
 
     client = await start(Served)
     assert (await client.get("/align/frame.jpg")).status == 503
-    outcome = Scene(within.judge).next()
-    await pages.frame(outcome)
+    result = Scene(within.track_and_decide).next()
+    await pages.on_frame_result(result)
     answer = await client.get("/align/frame.jpg")
-    assert await answer.read() == bytes(outcome.picture.frame.jpeg or b"")
+    assert await answer.read() == bytes(result.picture.frame.jpeg or b"")
     state = await (await client.get("/align/state")).json()
     assert state["live"]
     ask = {"values": state["running"], "frame": {"width": 960, "height": 640}}

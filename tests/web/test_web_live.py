@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import simplejpeg
 from aiohttp import web
-from web_fakes import OPEN, SIGNALS, Scene, inside, small
+from web_fakes import OPEN, SIGNALS, Scene, small, web_context
 
 from bikeped.config import load_config
 from bikeped.pipeline.replay import replay
-from bikeped.pipeline.web_context import Inside
+from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.mqtt import MqttStatus
@@ -33,11 +33,11 @@ PATIENCE_S = 20.0
 class Page:
     """The live page's server with a state that the test feeds."""
 
-    def __init__(self, within: Inside) -> None:
-        self.inside = within
+    def __init__(self, within: WebContext) -> None:
+        self.web_context = within
         self.state = LiveState()
         self.live = LivePage(self.state, within)
-        self.scene = Scene(within.judge)
+        self.scene = Scene(within.track_and_decide)
         app = make_application(OPEN, partial(add_live, live=self.live))
         self.server = HttpServer(app, within.loaded.config.web)
         self.url = ""
@@ -47,9 +47,9 @@ class Page:
         self.url = f"http://127.0.0.1:{self.server.port}"
 
     async def show(self, signal: str = "SAFE", sentence: str = "a sentence", **more: Any) -> None:
-        outcome = self.scene.next(signal, **more)
-        self.state.signal(SIGNALS[signal], sentence, outcome.judgement.decision)
-        await self.state.frame(outcome)
+        result = self.scene.next(signal, **more)
+        self.state.on_signal(SIGNALS[signal], sentence, result.tracking.decision)
+        await self.state.on_frame_result(result)
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ async def make_page() -> AsyncIterator[Callable[..., Any]]:
     pages: list[Page] = []
 
     async def make(*overrides: str, **options: Any) -> Page:
-        pages.append(Page(inside(small(*overrides), **options)))
+        pages.append(Page(web_context(small(*overrides), **options)))
         await pages[-1].start()
         return pages[-1]
 
@@ -96,7 +96,7 @@ async def test_events_tell_the_state_the_reason_and_the_tracks(make_page):
         hello = await events.until("hello")
         assert hello["stages"] == list(STAGES)
         assert hello["source"] == "drawn.avi"
-        assert hello["config_hash"] == page.inside.loaded.hash
+        assert hello["config_hash"] == page.web_context.loaded.hash
         now = await events.until("now")
         assert (now["signal"], now["colour"], now["sentence"]) == ("SAFE", "green", "a sentence")
         for _ in range(4):
@@ -104,12 +104,12 @@ async def test_events_tell_the_state_the_reason_and_the_tracks(make_page):
         now = await events.until("now", lambda data: data["frame"] == 4)
         assert (now["signal"], now["blink_hz"]) == ("ALERT", 2.0)
         assert [track["kind"] for track in now["tracks"]] == ["pedestrian", "cyclist"]
-        tracks = page.state.outcome.judgement.tracks
+        tracks = page.state.result.tracking.tracks
         assert [(t["x"], t["y"]) for t in now["tracks"]] == [
             tuple(xy) for xy in tracks.xy_m.round(3).tolist()
         ]
         assert 0 <= now["frame_age_s"] < PATIENCE_S
-        page.state.signal(SIGNALS["FAULT"], "camera: no frame for 2.0 s", None)
+        page.state.on_signal(SIGNALS["FAULT"], "camera: no frame for 2.0 s", None)
         now = await events.until("now", lambda data: data["signal"] == "FAULT")
         assert now["faults"] == ["camera: no frame for 2.0 s"]
         status = await events.until("status")
@@ -155,7 +155,7 @@ async def test_without_news_the_ages_grow(make_page):
 
 
 async def test_alerts_are_kept_with_their_numbers_and_bounded():
-    page = Page(inside(small("decision.d_min_m=0.1", "decision.memory_frames=0")))
+    page = Page(web_context(small("decision.d_min_m=0.1", "decision.memory_frames=0")))
     state = page.state
     for _ in range(20):
         await page.show()
@@ -168,8 +168,8 @@ async def test_alerts_are_kept_with_their_numbers_and_bounded():
     assert alert.ended_unix_s is None
     number = state.alerts_number
     for _ in range(3 * ALERTS):
-        page.inside.judge.reset()
-        page.scene = Scene(page.inside.judge)
+        page.web_context.track_and_decide.reset()
+        page.scene = Scene(page.web_context.track_and_decide)
         for _ in range(6):
             await page.show()
     assert len(state.alerts) == ALERTS
@@ -180,16 +180,16 @@ async def test_alerts_are_kept_with_their_numbers_and_bounded():
 async def test_latencies_become_a_point_a_second_and_are_bounded():
     now_s = [1000.0]
     state = LiveState(wall_clock=lambda: now_s[0])
-    scene = Scene(inside().judge)
-    outcomes = [scene.next() for _ in range(6)]
+    scene = Scene(web_context().track_and_decide)
+    results = [scene.next() for _ in range(6)]
     for second in range(TREND_S + 30):
         now_s[0] = 1000.0 + second
-        for outcome in outcomes:
-            await state.frame(outcome)
+        for result in results:
+            await state.on_frame_result(result)
     assert len(state.trend) == TREND_S
     point = state.trend[-1]
     assert (point.unix_s, point.fps) == (1000.0 + TREND_S + 28, 6)
-    inference = [outcome.latency_ms["inference"] for outcome in outcomes]
+    inference = [result.latency_ms["inference"] for result in results]
     row = STAGES.index("inference")
     assert point.p50[row] == round(float(np.percentile(inference, 50)), 2)
     assert point.p95[row] == round(float(np.percentile(inference, 95)), 2)
@@ -270,9 +270,9 @@ async def test_many_lookers_share_one_drawing(make_page):
 
 async def test_a_damaged_frame_is_a_picture_less_and_no_more(make_page, caplog):
     page = await make_page("web.stream_fps=30")
-    outcome = page.scene.next()
-    object.__setattr__(outcome.picture.frame, "jpeg", b"\xff\xd8 no picture")
-    await page.state.frame(outcome)
+    result = page.scene.next()
+    object.__setattr__(result.picture.frame, "jpeg", b"\xff\xd8 no picture")
+    await page.state.on_frame_result(result)
     async with aiohttp.ClientSession() as session, session.get(f"{page.url}/live/stream") as answer:
         waiting = asyncio.create_task(Pictures(answer).next())
         while not waiting.done():
@@ -361,12 +361,12 @@ class Probe(ServicePages):
         self._visit = visit
         self.found: Any = None
 
-    def application(self, within: Inside) -> web.Application:
+    def application(self, within: WebContext) -> web.Application:
         self.app = super().application(within)
         return self.app
 
-    async def frame(self, outcome: Any) -> None:
-        await super().frame(outcome)
+    async def on_frame_result(self, result: Any) -> None:
+        await super().on_frame_result(result)
         if self.state.frames == 3:
             self.found = await self._visit("", self.app)
 

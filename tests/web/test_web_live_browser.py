@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 from aiohttp import web
-from drawn_eyes import clip_eye
+from drawn_detectors import clip_detector
 from playwright.sync_api import Page, expect
-from web_fakes import DESKTOP, OPEN, PHONE, SIGNALS, Scene, inside, small
+from web_fakes import DESKTOP, OPEN, PHONE, SIGNALS, Scene, small, web_context
 
 from bikeped.config import load_config
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
@@ -51,19 +51,19 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-class SlowEye:
+class SlowDetector:
     """Takes its time over every frame until it may hurry: a slow browser misses nothing."""
 
     def __init__(self, clip: Path) -> None:
-        self._eye = clip_eye(sidecar_path(clip))
-        self.name, self.model_hash = self._eye.name, None
-        self.riders_whole = self._eye.riders_whole
-        self.decode_size = self._eye.decode_size
+        self._detector = clip_detector(sidecar_path(clip))
+        self.name, self.model_hash = self._detector.name, None
+        self.cyclist_box_includes_rider = self._detector.cyclist_box_includes_rider
+        self.decode_size = self._detector.decode_size
         self.hurry = threading.Event()
 
-    def see(self, picture: Any) -> Any:
+    def detect(self, picture: Any) -> Any:
         self.hurry.wait(0.3)
-        return self._eye.see(picture)
+        return self._detector.detect(picture)
 
 
 class Running:
@@ -75,7 +75,7 @@ class Running:
         self.pages = ServicePages(self.loaded)
         self.result: ReplayResult | None = None
         self._clip, self._events = clip, events
-        self.eye = SlowEye(clip)
+        self.detector = SlowDetector(clip)
         self._address = threading.Event()
         self.url = ""
         handler = logging.Handler(logging.INFO)
@@ -98,14 +98,14 @@ class Running:
         self.result = replay(
             self.loaded,
             str(self._clip),
-            eye=self.eye,
+            detector=self.detector,
             files=ReplayFiles(events=self._events),
             mqtt=False,
             pages=self.pages,
         )
 
     def wait(self) -> None:
-        self.eye.hurry.set()
+        self.detector.hurry.set()
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         self._log.removeHandler(self._handler)
@@ -171,9 +171,9 @@ class Told:
     """A live page's server; it tells what the test wants told, again and again."""
 
     def __init__(self, start: Callable[..., Any]) -> None:
-        self.within = inside(small("web.stream_fps=30", "decision.d_min_m=0.1"))
+        self.within = web_context(small("web.stream_fps=30", "decision.d_min_m=0.1"))
         self.state = LiveState()
-        self.scene = Scene(self.within.judge)
+        self.scene = Scene(self.within.track_and_decide)
         self._telling = ("SAFE", "Somebody is here.")
         self.ticks = True
         self.served = start(self._make)
@@ -198,9 +198,9 @@ class Told:
             name, sentence = self._telling
             if self.ticks:
                 decision = None
-                if self.state.outcome is not None:
-                    decision = self.state.outcome.judgement.decision
-                self.state.signal(SIGNALS[name], sentence, decision)
+                if self.state.result is not None:
+                    decision = self.state.result.tracking.decision
+                self.state.on_signal(SIGNALS[name], sentence, decision)
             await asyncio.sleep(0.05)
 
     def tell(self, name: str, sentence: str = "Because.") -> None:
@@ -230,7 +230,7 @@ def test_every_state_has_a_word_a_shape_and_a_reason(told, open_page, assert_acc
     expect(page.locator("#state-sentence")).to_have_text("Because of this")
     expect(page.locator("#state-mark svg")).to_have_count(1)
     expect(page).to_have_title(f"{name.capitalize()} · Live · bikeped")
-    expect(page.locator("#announcer")).to_contain_text(name.capitalize())
+    expect(page.locator("#dispatcher")).to_contain_text(name.capitalize())
     assert_accessible(page)
 
 
@@ -296,7 +296,7 @@ def test_a_dead_server_leaves_no_reassuring_colour(told, open_page, page_errors)
     safe = page.evaluate("getComputedStyle(document.querySelector('#state')).backgroundColor")
     told.served.stop()
     expect(page.locator("#state-word")).to_have_text("No contact")
-    expect(page.locator("#announcer")).to_contain_text("No contact")
+    expect(page.locator("#dispatcher")).to_contain_text("No contact")
     grey = page.evaluate("getComputedStyle(document.querySelector('#state')).backgroundColor")
     assert grey != safe
     red, green, blue = map(int, re.findall(r"\d+", grey)[:3])

@@ -20,7 +20,7 @@ from bikeped.lab.simulation.metrics import Metrics, measure
 from bikeped.lab.simulation.perception import PerceptionResult
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.suite import Suite
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Detections, GroundPoints
 
 States = npt.NDArray[np.int8]
@@ -40,16 +40,21 @@ def run_ablation(
     suite: Suite, runs: Sequence[EndToEndRun], loaded: LoadedConfig, decision: DecisionConfig
 ) -> list[AblationStep]:
     """The rungs from scripted positions to the deployed loop, over all scenarios of `suite`."""
-    judge = Judge(loaded, riders_whole=all(run.riders_whole for run in runs))
+    track_and_decide = TrackAndDecide(
+        loaded, cyclist_box_includes_rider=all(run.cyclist_box_includes_rider for run in runs)
+    )
     seen = suite.perception_results
 
     def points(present: Callable[[EndToEndRun, int, int], bool]) -> States:
         return np.concatenate(
-            [_judge_points(judge, s, run, present) for s, run in zip(seen, runs, strict=True)]
+            [
+                _judge_points(track_and_decide, s, run, present)
+                for s, run in zip(seen, runs, strict=True)
+            ]
         )
 
     def boxes(of: Callable[[EndToEndRun, int], Detections]) -> States:
-        return np.concatenate([_judge_boxes(judge, run, of) for run in runs])
+        return np.concatenate([_judge_boxes(track_and_decide, run, of) for run in runs])
 
     steps: list[tuple[str, str, States]] = [
         ("scripted", "positions with the box model's error", suite.states(decision)),
@@ -73,12 +78,12 @@ def run_ablation(
 
 
 def _judge_points(
-    judge: Judge,
+    track_and_decide: TrackAndDecide,
     seen: PerceptionResult,
     run: EndToEndRun,
     present: Callable[[EndToEndRun, int, int], bool],
 ) -> States:
-    judge.reset()
+    track_and_decide.reset()
     states = []
     for frame in range(len(seen.present)):
         index = np.asarray(
@@ -90,17 +95,21 @@ def _judge_points(
             np.int64,
         )
         points = GroundPoints(seen.kind[index], seen.observed_m[frame, index], index)
-        states.append(int(judge.judge_points(points, frame / FPS).decision.state))
+        states.append(int(track_and_decide.update_from_points(points, frame / FPS).decision.state))
     return np.asarray(states, np.int8)
 
 
 def _judge_boxes(
-    judge: Judge, run: EndToEndRun, of: Callable[[EndToEndRun, int], Detections]
+    track_and_decide: TrackAndDecide, run: EndToEndRun, of: Callable[[EndToEndRun, int], Detections]
 ) -> States:
-    judge.reset()
+    track_and_decide.reset()
     return np.asarray(
         [
-            int(judge.judge(of(run, f), run.width, run.height, f / FPS, 0.0).decision.state)
+            int(
+                track_and_decide.update(
+                    of(run, f), run.width, run.height, f / FPS, 0.0
+                ).decision.state
+            )
             for f in range(len(run.state))
         ],
         np.int8,

@@ -12,7 +12,7 @@ from bikeped.config import LoadedConfig
 from bikeped.lab.endtoend.matching import MIN_VISIBLE, match_detections
 from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.simulation.perception import PerceptionResult
-from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.types import Detections, FloatArray, Kind
 
 #: Bounds of the distance rings, metres from the camera.
@@ -43,13 +43,13 @@ def collect_observations(
     runs: Sequence[EndToEndRun], seen: Sequence[PerceptionResult], loaded: LoadedConfig
 ) -> Observations:
     """What there was to see in `runs`, and what became of it."""
-    viewpoint = Viewpoint(loaded)
+    ground_mapper = GroundMapper(loaded)
     rows: list[tuple[float, ...]] = []
     false = dict.fromkeys(Kind, 0)
     frames = 0
     for run, script in zip(runs, seen, strict=True):
         column = {agent.id: i for i, agent in enumerate(run.scenario.agents)}
-        framing = viewpoint.framing_of(run.width, run.height)
+        framing = ground_mapper.framing_for(run.width, run.height)
         for frame, (objects, detections) in enumerate(
             zip(run.objects, run.detections, strict=True)
         ):
@@ -57,13 +57,15 @@ def collect_observations(
             matched = match_detections(detections, objects)
             for kind in detections.kind[matched.object < 0].tolist():
                 false[Kind(kind)] += 1
-            found_xy = _on_ground(viewpoint, framing.frame_to_crop(detections.bottom_centre_px()))
+            found_xy = _on_ground(
+                ground_mapper, framing.frame_to_crop(detections.bottom_centre_px())
+            )
             boxes = Detections(
                 np.zeros(len(objects), np.int8),
                 np.ones(len(objects), np.float32),
                 np.asarray([o.box_px for o in objects], np.float32).reshape(-1, 4),
             )
-            exact_xy = _on_ground(viewpoint, framing.frame_to_crop(boxes.bottom_centre_px()))
+            exact_xy = _on_ground(ground_mapper, framing.frame_to_crop(boxes.bottom_centre_px()))
             for index, item in enumerate(objects):
                 if item.visible < MIN_VISIBLE or item.id not in column:
                     continue  # hidden; or a parked car, which no scenario knows
@@ -83,9 +85,9 @@ def collect_observations(
     return Observations(frames, false, *table.T)
 
 
-def _on_ground(viewpoint: Viewpoint, crop_px: FloatArray) -> FloatArray:
+def _on_ground(ground_mapper: GroundMapper, crop_px: FloatArray) -> FloatArray:
     """[n, 2] places of bottom centres; NaN where they lie on no ground."""
-    xy, valid = viewpoint.table.lookup(crop_px)
+    xy, valid = ground_mapper.table.lookup(crop_px)
     return np.asarray(np.where(valid[:, None], xy, np.nan))
 
 

@@ -16,12 +16,12 @@ from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
-from bikeped.pipeline.detection_stage import Eye, Vision
-from bikeped.pipeline.factory import load_eye
+from bikeped.pipeline.detection_stage import DetectionStage, FrameDetector
+from bikeped.pipeline.factory import load_detector_pool
 from bikeped.pipeline.feed import RecordedFeed
-from bikeped.pipeline.loop import Loop, Outcome
-from bikeped.pipeline.signal_dispatcher import Announcer
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.loop import FrameResult, Loop
+from bikeped.pipeline.signal_dispatcher import SignalDispatcher
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Detections
 
 
@@ -37,7 +37,7 @@ class EndToEndRun:
     height: int
     detector: str
     model_hash: str | None
-    riders_whole: bool  #: as the detector has it
+    cyclist_box_includes_rider: bool  #: as the detector has it
 
 
 class _Kept:
@@ -47,9 +47,9 @@ class _Kept:
         self.detections: list[Detections] = []
         self.state: list[int] = []
 
-    async def frame(self, outcome: Outcome) -> None:
-        self.detections.append(outcome.detections)
-        self.state.append(int(outcome.judgement.decision.state))
+    async def on_frame_result(self, result: FrameResult) -> None:
+        self.detections.append(result.detections)
+        self.state.append(int(result.tracking.decision.state))
 
 
 def run_scenario(
@@ -57,21 +57,23 @@ def run_scenario(
     scenario: Scenario,
     conditions: Conditions,
     size: tuple[int, int],
-    eye: Eye | None = None,
+    detector: FrameDetector | None = None,
 ) -> EndToEndRun:
-    """Draws `scenario` and runs it through the loop; `eye` in place of the configured model."""
-    looking = eye if eye is not None else load_eye(loaded)
+    """Draws `scenario` and runs it through the loop; `detector` replaces the configured model."""
+    looking = detector if detector is not None else load_detector_pool(loaded)
     painter = ScenePainter(scenario, scene_camera(loaded, size), conditions)
     source = DrawnSource(painter, scenario.name, scenario.frame_times(FPS).tolist(), FPS)
     kept = _Kept()
-    judge = Judge(loaded, riders_whole=looking.riders_whole)
+    track_and_decide = TrackAndDecide(
+        loaded, cyclist_box_includes_rider=looking.cyclist_box_includes_rider
+    )
 
     async def through() -> None:
         loop = Loop(
             feed=RecordedFeed(source),
-            vision=Vision(looking),
-            judge=judge,
-            announcer=Announcer(SignalLogic.from_config(loaded.config.feedback)),
+            detection=DetectionStage(looking),
+            track_and_decide=track_and_decide,
+            dispatcher=SignalDispatcher(SignalLogic.from_config(loaded.config.feedback)),
             outputs=[kept],
         )
         await loop.run()
@@ -86,7 +88,7 @@ def run_scenario(
         height=size[1],
         detector=looking.name,
         model_hash=looking.model_hash,
-        riders_whole=looking.riders_whole,
+        cyclist_box_includes_rider=looking.cyclist_box_includes_rider,
     )
 
 

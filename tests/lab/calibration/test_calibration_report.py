@@ -33,7 +33,7 @@ from bikeped.lab.calibration.solver.lens_model import Model
 from bikeped.lab.calibration.solver.observations import prepare
 from bikeped.lab.calibration.solver.outliers import LeftOut
 from bikeped.lab.simulation.suite import Suite
-from bikeped.pipeline.ground_mapper import Viewpoint
+from bikeped.pipeline.ground_mapper import GroundMapper
 
 FRAMING = Framing(3840, 2160, 3840, 3500)
 K = (0.01, -0.012, 0.004, -0.0007)
@@ -90,7 +90,7 @@ def test_run_replay_and_conformance_read_all_four_terms(done: Calibrated, tmp_pa
     cut = load_config(config, ["camera.k3=0", "camera.k4=0"])
     pixel = np.array([[2900.0, 2900.0]])
     suites = [Suite.load([], loaded), Suite.load([], cut)]
-    judged = [Viewpoint(loaded), Viewpoint(cut)]  # the loop's own, for run and replay
+    judged = [GroundMapper(loaded), GroundMapper(cut)]  # the loop's own, for run and replay
     for all_four, two in (suites, judged):
         assert all_four.camera.lens.k == done.fits["equidistant+k4"].state.terms
         here, _ = all_four.camera.ground(pixel)

@@ -2,13 +2,13 @@ import json
 from pathlib import Path
 
 import pytest
-from drawn_eyes import boxes
+from drawn_detectors import boxes
 
 from bikeped.config import load_config
 from bikeped.lab.demo import bundled_scenario, format_summary, summarise
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import load_scenario
-from bikeped.pipeline.track_and_decide import Judge
+from bikeped.pipeline.track_and_decide import TrackAndDecide
 
 CONFIG = Path(__file__).parents[3] / "config.yaml"
 
@@ -81,10 +81,10 @@ def test_the_story_passes_through_all_four_states():
     loaded = load_config(CONFIG)
     scenario = load_scenario(bundled_scenario())
     painter = ScenePainter(scenario, scene_camera(loaded, (1920, 1080)), Conditions())
-    judge = Judge(loaded)
+    track_and_decide = TrackAndDecide(loaded)
     events = []
     for number, t in enumerate(scenario.frame_times(30).tolist()):
-        found = judge.judge(boxes(painter.objects(t)), 1920, 1080, t + 1e-9, 0.0)
+        found = track_and_decide.update(boxes(painter.objects(t)), 1920, 1080, t + 1e-9, 0.0)
         tracks, pair = found.tracks, found.decision.pair
         events.append(
             {

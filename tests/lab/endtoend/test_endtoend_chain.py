@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn_eyes import OracleEye
+from drawn_detectors import OracleDetector
 
 from bikeped.config import LoadedConfig, load_config
 from bikeped.lab.endtoend.ablation import run_ablation
@@ -37,7 +37,7 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope="module")
 def run(loaded: LoadedConfig, scenario: Scenario) -> EndToEndRun:
-    """With an eye that sees all that can be seen, and one bush that it takes for a walker."""
+    """With an detector that sees all that can be seen, and one bush that it takes for a walker."""
     painter = ScenePainter(scenario, scene_camera(loaded, SIZE), Conditions())
     times = scenario.frame_times().tolist()
 
@@ -51,7 +51,7 @@ def run(loaded: LoadedConfig, scenario: Scenario) -> EndToEndRun:
             np.asarray(corners, np.float32),
         )
 
-    return run_scenario(loaded, scenario, Conditions(), SIZE, OracleEye(boxes))
+    return run_scenario(loaded, scenario, Conditions(), SIZE, OracleDetector(boxes))
 
 
 def test_every_frame_is_decided_once(run: EndToEndRun, scenario: Scenario) -> None:
@@ -76,12 +76,14 @@ def test_a_perfect_eye_loses_nothing_between_occlusion_and_its_boxes(
 def test_the_loop_and_the_ladder_decide_alike(
     run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
-    """The last rung comes out of the loop, the others out of its judge: same boxes, same states."""
+    """The last step comes out of the loop, the others out of its tracker: same boxes and states."""
     from bikeped.lab.endtoend.ablation import _judge_boxes
-    from bikeped.pipeline.track_and_decide import Judge
+    from bikeped.pipeline.track_and_decide import TrackAndDecide
 
-    judge = Judge(loaded, riders_whole=run.riders_whole)
-    again = _judge_boxes(judge, run, lambda r, f: r.detections[f])
+    track_and_decide = TrackAndDecide(
+        loaded, cyclist_box_includes_rider=run.cyclist_box_includes_rider
+    )
+    again = _judge_boxes(track_and_decide, run, lambda r, f: r.detections[f])
     np.testing.assert_array_equal(again, run.state)
 
 

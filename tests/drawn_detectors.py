@@ -14,12 +14,12 @@ from bikeped.pipeline.detection_stage import Picture
 from bikeped.types import Detections
 
 
-class OracleEye:
+class OracleDetector:
     """Answers with `of(frame number)`."""
 
     name = "oracle"
     model_hash: str | None = None
-    riders_whole = True
+    cyclist_box_includes_rider = True
 
     def __init__(self, of: Callable[[int], Detections]) -> None:
         self._of = of
@@ -27,14 +27,14 @@ class OracleEye:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return min(width, 640), min(height, 640)
 
-    def see(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectorAnswer:
         return DetectorAnswer(self._of(picture.frame.number), 0.0, 0.0, 0.0)
 
 
-def clip_eye(sidecar: Path) -> OracleEye:
+def clip_detector(sidecar: Path) -> OracleDetector:
     """Sees in every frame of a drawn clip whoever shows."""
     frames = read_sidecar(sidecar).frames
-    return OracleEye(lambda number: boxes([o for o in frames[number] if o.visible > 0.1]))
+    return OracleDetector(lambda number: boxes([o for o in frames[number] if o.visible > 0.1]))
 
 
 def boxes(objects: Sequence[DrawnObject]) -> Detections:
