@@ -7,29 +7,19 @@ from pathlib import Path
 
 import msgspec
 
-from bikeped.config.load import _apply, _explain, _yaml_mapping
+from bikeped.config.load import _apply, _explain, _yaml_mapping, read_text
 from bikeped.config.schema.decision import DecisionConfig
 from bikeped.config.schema.inputs import Config
 from bikeped.errors import ConfigError
-
-_MAX_BYTES = 1_000_000
 
 
 def load_decision(path: Path, overrides: Sequence[str] = ()) -> DecisionConfig:
     """The decision section of a file that holds only it, or of a whole configuration.
 
     Keys that the section leaves out take their defaults, as they do in config.yaml. `overrides`
-    are `decision.KEY=VALUE`. Raises ConfigError naming the file, the key and the mend.
+    are `decision.KEY=VALUE`. Raises ConfigError naming the file, the key and the remedy.
     """
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{path}: larger than 1 MB; a candidate is a short text")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from error
-    return parse_decision(text, str(path), overrides)
+    return parse_decision(read_text(path, "check the path"), str(path), overrides)
 
 
 def parse_decision(text: str, source: str, overrides: Sequence[str] = ()) -> DecisionConfig:

@@ -72,17 +72,20 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Load
     Paths given by an override are relative to the working directory, as a person would type them.
     """
     file = path if path is not None else default_config_path()
-    try:
-        if file.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{file}: larger than 1 MB; a configuration is a short text")
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(
-            f"{file}: cannot be read ({error.strerror}); give a configuration with -c"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{file}: is not UTF-8 text; save it as UTF-8") from error
+    text = read_text(file, "give a configuration with -c")
     return parse_config(text, str(file), file.parent, overrides)
+
+
+def read_text(path: Path, remedy: str) -> str:
+    """The text of a YAML file, line ends as they are; ConfigError says what to do (`remedy`)."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigError(f"{path}: larger than 1 MB; a configuration is a short text")
+        return path.read_bytes().decode("utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from error
 
 
 def parse_config(

@@ -7,7 +7,6 @@ import stat
 
 import click
 import pytest
-import yaml
 
 from bikeped.config import DecisionConfig, load_config
 from bikeped.config.candidate import parse_decision
@@ -187,35 +186,6 @@ def test_mode_and_link_of_the_configuration_stay(place):
     assert link.is_symlink()
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
     assert "promoted" in path.read_text()
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "a: 1\ndecision: {rule: ttc}  # inline\nb: 2 # kept\n",
-        "a: 1\ndecision:\nb: 2\n",
-        "decision:\n  rule: ttc",
-        "decision:\n  rule: >-\n    ttc\n# kept\na: 1\n",
-        "---\na: 1\n'decision':\n    rule: ttc\n\n  # inner\n# kept\nb: [1,\n  2]\n",
-        "  a: 1\n  decision:\n    rule: ttc\n  b: 2\n",
-        "a: 1\r\ndecision:\r\n  rule: ttc # x\r\n# kept\r\nb: 2\r\n",
-        "a: 1  # no section at all",
-        "",
-        "\ufeffa: 1\ndecision:\n  rule: ttc\n",
-    ],
-)
-def test_any_way_to_write_the_section_is_replaced_alone(text):
-    other = DecisionConfig(rule="naive", d_max_m=12.5)
-    new = promoting.replace_section(text, "x", other, "note")
-    data, was = yaml.safe_load(new), yaml.safe_load(text) or {}
-    assert parse_decision(yaml.safe_dump({"decision": data.pop("decision")}), "x") == other
-    was.pop("decision", None)
-    assert data == was
-    assert ("# kept" in text) == ("# kept" in new)
-    assert ("\r\n" in text) == ("\r\n" in new)
-    assert new.replace("\r\n", "").count("\r") == 0
-    again = promoting.replace_section(new, "x", other, "note")
-    assert again == new
 
 
 def test_a_configuration_in_braces_is_refused(place):
