@@ -13,12 +13,13 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
-import aiomqtt
 import numpy as np
 import onnx
 import pytest
 import simplejpeg
 from onnx import TensorProto, helper, numpy_helper
+from paho.mqtt.client import Client, MQTTMessage
+from paho.mqtt.enums import CallbackAPIVersion
 
 from bikeped.lab.rendering.avi_writer import AviWriter
 
@@ -182,18 +183,20 @@ async def make_proxy() -> AsyncIterator[Callable[[int], Proxy]]:
         await proxy.close()
 
 
+Received = tuple[str, bytes, bool]  # topic, payload, retained
+
+
 class Listener:
     """A subscriber that remembers all it received, and can wait for more."""
 
-    def __init__(self, client: aiomqtt.Client) -> None:
-        self.client = client
-        self.received: list[tuple[str, bytes, bool]] = []  # topic, payload, retained
+    def __init__(self) -> None:
+        self.received: list[Received] = []
+        self.queue: asyncio.Queue[Received] = asyncio.Queue()
 
-    async def until(self, done: Callable[[list[tuple[str, bytes, bool]]], bool]) -> None:
+    async def until(self, done: Callable[[list[Received]], bool]) -> None:
         async def receive() -> None:
             while not done(self.received):
-                message = await anext(self.client.messages)
-                self.received.append((message.topic.value, message.payload, message.retain))
+                self.received.append(await self.queue.get())
 
         await asyncio.wait_for(receive(), DEADLINE_S)
 
@@ -204,10 +207,28 @@ class Listener:
 @pytest.fixture
 def listen() -> Callable[..., contextlib.AbstractAsyncContextManager[Listener]]:
     @contextlib.asynccontextmanager
-    async def subscribe(port: int, topic: str, **options: object) -> AsyncIterator[Listener]:
-        async with aiomqtt.Client("127.0.0.1", port, **options) as client:
-            await client.subscribe(topic, qos=1)
-            yield Listener(client)
+    async def subscribe(
+        port: int, topic: str, username: str | None = None, password: str | None = None
+    ) -> AsyncIterator[Listener]:
+        loop, listener, subscribed = asyncio.get_running_loop(), Listener(), asyncio.Event()
+        client = Client(CallbackAPIVersion.VERSION2)
+        client.username_pw_set(username, password)
+
+        def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
+            received = (message.topic, message.payload, message.retain)
+            loop.call_soon_threadsafe(listener.queue.put_nowait, received)
+
+        client.on_message = on_message
+        client.on_connect = lambda *_: client.subscribe(topic, qos=1)
+        client.on_subscribe = lambda *_: loop.call_soon_threadsafe(subscribed.set)
+        client.connect("127.0.0.1", port)
+        client.loop_start()
+        try:
+            await asyncio.wait_for(subscribed.wait(), DEADLINE_S)
+            yield listener
+        finally:
+            client.disconnect()
+            await asyncio.to_thread(client.loop_stop)
 
     return subscribe
 

@@ -6,7 +6,6 @@ service cannot do its work, `warn` that it does, but somebody should look.
 
 from __future__ import annotations
 
-import asyncio
 import datetime as dt
 import math
 import os
@@ -21,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import aiomqtt
 import numpy as np
 
 from bikeped.capture import open_source
@@ -36,6 +34,7 @@ from bikeped.pipeline.detection_stage import Picture
 from bikeped.pipeline.factory import load_detector_pool
 from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.telemetry.mqtt_auth import load_credentials
+from bikeped.telemetry.mqtt_connection import BrokerConnection
 from bikeped.types import Frame, Sound
 
 Status = Literal["ok", "warn", "fail", "skipped"]
@@ -260,30 +259,24 @@ def check_broker(loaded: LoadedConfig) -> Finding:
     mqtt = loaded.config.mqtt
     if not mqtt.enabled:
         return Finding("broker", "skipped", "mqtt.enabled is false")
-    credentials = load_credentials(mqtt, loaded.base_dir)
-
-    async def connect() -> None:
-        async with aiomqtt.Client(
-            mqtt.host,
-            mqtt.port,
-            username=credentials.username,
-            password=credentials.password,
-            tls_context=credentials.tls,
-            identifier=f"bikeped-doctor-{os.getpid()}",
-            timeout=5.0,
-        ):
-            pass
-
+    connection = BrokerConnection(
+        mqtt,
+        load_credentials(mqtt, loaded.base_dir),
+        client_id=f"bikeped-doctor-{os.getpid()}",
+        timeout_s=5.0,
+    )
     began = time.perf_counter()
     try:
-        asyncio.run(connect())
-    except (aiomqtt.MqttError, OSError) as error:
+        connection.open()
+    except OSError as error:
         return Finding(
             "broker",
             "warn",  # the crossing is watched all the same
-            f"{mqtt.host}:{mqtt.port}: {' '.join(str(error.__cause__ or error).split())}",
+            f"{mqtt.host}:{mqtt.port}: {' '.join(str(error).split())}",
             "check mqtt.host, mqtt.port, mqtt.username, mqtt.tls, and that the broker runs",
         )
+    finally:
+        connection.close()
     took_ms = (time.perf_counter() - began) * 1e3
     return Finding("broker", "ok", f"{mqtt.host}:{mqtt.port} answers in {took_ms:.0f} ms")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import time
 
@@ -58,9 +59,9 @@ def header_of(loaded: LoadedConfig, detector: FrameDetector) -> EventHeader:
     )
 
 
-async def start_publisher(loaded: LoadedConfig, stack: contextlib.AsyncExitStack) -> MqttPublisher:
+def start_publisher(loaded: LoadedConfig, stack: contextlib.AsyncExitStack) -> MqttPublisher:
     """A publisher that is stopped (and says `offline`) when `stack` unwinds."""
     publisher = MqttPublisher(loaded.config.mqtt, base_dir=loaded.base_dir)
-    await publisher.start()
-    stack.push_async_callback(publisher.stop)
+    publisher.start()
+    stack.push_async_callback(asyncio.to_thread, publisher.stop)
     return publisher

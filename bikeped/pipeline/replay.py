@@ -164,7 +164,7 @@ async def _replay(
     config = loaded.config
     summary = ReplaySummary()
     async with contextlib.AsyncExitStack() as stack:
-        publisher = await start_publisher(loaded, stack) if mqtt else None
+        publisher = start_publisher(loaded, stack) if mqtt else None
         metrics = Metrics() if pages is not None else None
         telemetry = Telemetry(
             loaded, track_and_decide, publisher=publisher, metrics=metrics, remember=REMEMBER

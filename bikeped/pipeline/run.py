@@ -111,7 +111,7 @@ async def _serve(
     config, camera = loaded.config, loaded.config.camera
     speaker = open_speaker(config.feedback, loaded.base_dir)
     stack.push_async_callback(speaker.close)
-    publisher = await start_publisher(loaded, stack) if config.mqtt.enabled else None
+    publisher = start_publisher(loaded, stack) if config.mqtt.enabled else None
     audit = None
     if config.audit.path is not None:
         audit = AuditLog(config.audit, header_of(loaded, detector), base_dir=loaded.base_dir)

@@ -32,7 +32,11 @@ def publisher(settings: MqttConfig, **options: Any) -> MqttPublisher:
 
 
 async def connected(mqtt: MqttPublisher) -> None:
-    await asyncio.wait_for(mqtt.wait_connected(), DEADLINE_S)
+    await until(lambda: mqtt.status.connected)
+
+
+async def stop(mqtt: MqttPublisher) -> None:
+    await asyncio.to_thread(mqtt.stop)
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -47,7 +51,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 async def test_every_topic_arrives_and_only_the_right_ones_are_retained(broker, listen):
     mqtt = publisher(config(broker.port, "topics"))
-    await mqtt.start()
+    mqtt.start()
     await connected(mqtt)
     async with listen(broker.port, "bikeped/topics/#") as live:
         await live.until(lambda got: len(got) == 1)  # the retained online
@@ -69,23 +73,23 @@ async def test_every_topic_arrives_and_only_the_right_ones_are_retained(broker, 
     retained = {topic.rpartition("/")[2]: flag for topic, _, flag in late.received}
     assert retained == {"availability": True, "state": True, "health": True, "tracks": False}
     assert late.payloads("tracks") == [b"T2"]
-    await mqtt.stop()
+    await stop(mqtt)
     assert mqtt.status.published == 4
     assert mqtt.status.dropped == 0
 
 
 async def test_stop_leaves_offline_and_the_last_state(broker, listen):
     mqtt = publisher(config(broker.port, "goodbye"))
-    await mqtt.start()
+    mqtt.start()
     await connected(mqtt)
     mqtt.publish("state", b"OFF", retain=True, qos=1)
-    await mqtt.stop()
+    await stop(mqtt)
     assert not mqtt.status.connected
     async with listen(broker.port, "bikeped/goodbye/#") as late:
         await late.until(lambda got: len(got) == 2)
     assert late.payloads("availability") == [b"offline"]
     assert late.payloads("state") == [b"OFF"]
-    await mqtt.stop()  # again is harmless
+    await stop(mqtt)  # again is harmless
 
 
 async def test_the_will_says_offline_when_the_client_is_cut_off(broker, listen, make_proxy):
@@ -93,26 +97,24 @@ async def test_the_will_says_offline_when_the_client_is_cut_off(broker, listen, 
     await proxy.start()
     mqtt = publisher(config(proxy.port, "cut"))
     async with listen(broker.port, "bikeped/cut/availability") as live:
-        await mqtt.start()
+        mqtt.start()
         await live.until(lambda got: len(got) == 1)
         proxy.abort_broker_side()
         await live.until(lambda got: len(got) >= 2)
         proxy.abort_clients()
         await live.until(lambda got: len(got) >= 3)
     assert live.payloads("availability") == [b"online", b"offline", b"online"]
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 async def test_the_will_says_offline_when_the_process_is_killed(broker, listen):
     program = (
-        "import asyncio, sys\n"
+        "import sys, threading\n"
         "from bikeped.config.schema.inputs import MqttConfig\n"
         "from bikeped.telemetry.mqtt import MqttPublisher\n"
-        "async def main():\n"
-        "    mqtt = MqttPublisher(MqttConfig(port=int(sys.argv[1]), site='killed'))\n"
-        "    await mqtt.start()\n"
-        "    await asyncio.Event().wait()\n"
-        "asyncio.run(main())\n"
+        "mqtt = MqttPublisher(MqttConfig(port=int(sys.argv[1]), site='killed'))\n"
+        "mqtt.start()\n"
+        "threading.Event().wait()\n"
     )
     async with listen(broker.port, "bikeped/killed/availability") as live:
         child = await asyncio.create_subprocess_exec(
@@ -134,19 +136,19 @@ async def test_a_half_open_connection_of_before_does_not_say_offline_later(
     await proxy.start()
     mqtt = publisher(config(proxy.port, "halfopen"))
     async with listen(broker.port, "bikeped/halfopen/availability") as live:
-        await mqtt.start()
+        mqtt.start()
         await live.until(lambda got: len(got) == 1)
         proxy.abort_clients()  # the broker does not notice: its side stays open
         await live.until(lambda got: len(got) == 3)
     # The will came when the new connection was made, so it cannot come after it.
     assert live.payloads("availability") == [b"online", b"offline", b"online"]
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 async def test_messages_arrive_again_after_the_broker_was_killed(make_broker, listen):
     broker = make_broker()
     mqtt = publisher(config(broker.port, "restart"))
-    await mqtt.start()
+    mqtt.start()
     mqtt.publish("state", b"SAFE", retain=True, qos=1)
     await connected(mqtt)
     broker.kill()
@@ -171,14 +173,14 @@ async def test_messages_arrive_again_after_the_broker_was_killed(make_broker, li
     assert live.payloads("health")[-1] == b"H"
     assert mqtt.status.connects == 2
     assert mqtt.status.error is None
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 async def test_a_broker_that_hangs_costs_messages_not_time(broker, listen, make_proxy):
     proxy = make_proxy(broker.port)
     await proxy.start()
     mqtt = publisher(config(proxy.port, "hang"), io_timeout_s=0.2, stop_timeout_s=0.2)
-    await mqtt.start()
+    mqtt.start()
     await connected(mqtt)
     proxy.flowing.clear()
     mqtt.publish("state", b"ALERT", retain=True, qos=1)  # is never acknowledged
@@ -191,7 +193,7 @@ async def test_a_broker_that_hangs_costs_messages_not_time(broker, listen, make_
     async with listen(broker.port, "bikeped/hang/state") as live:
         await live.until(lambda got: len(got) >= 1)
     assert set(live.payloads("state")) == {b"ALERT"}
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 async def test_a_server_that_never_answers_is_given_up_without_leaking_sockets():
@@ -209,11 +211,11 @@ async def test_a_server_that_never_answers_is_given_up_without_leaking_sockets()
     server = await asyncio.start_server(swallow, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     mqtt = publisher(config(port, "silent", keepalive_s=3600), io_timeout_s=0.05)
-    await mqtt.start()
+    mqtt.start()
     await until(lambda: closed >= 3)  # three attempts, all of them closed by us
     assert "timed out" in (mqtt.status.error or "")
     assert mqtt.status.connects == 0
-    await mqtt.stop()
+    await stop(mqtt)
     await until(lambda: closed == len(taken))
     server.close()
     await server.wait_closed()
@@ -223,12 +225,49 @@ async def test_stop_is_bounded_when_the_broker_hangs(broker, make_proxy):
     proxy = make_proxy(broker.port)
     await proxy.start()
     mqtt = publisher(config(proxy.port, "stuck"), io_timeout_s=3600, stop_timeout_s=0.1)
-    await mqtt.start()
+    mqtt.start()
     await connected(mqtt)
     proxy.flowing.clear()
-    await asyncio.wait_for(mqtt.stop(), DEADLINE_S)
+    await asyncio.wait_for(stop(mqtt), DEADLINE_S)
     assert not mqtt.status.connected
     proxy.flowing.set()
+
+
+async def test_stop_ends_an_attempt_that_hangs_at_once_and_closes_its_socket():
+    accepted, closed = asyncio.Event(), asyncio.Event()
+
+    async def swallow(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        accepted.set()
+        await reader.read()  # until the client closes
+        closed.set()
+        writer.close()
+
+    server = await asyncio.start_server(swallow, "127.0.0.1", 0)
+    mqtt = publisher(
+        config(server.sockets[0].getsockname()[1], "hanging", keepalive_s=3600), io_timeout_s=3600
+    )
+    mqtt.start()
+    await asyncio.wait_for(accepted.wait(), DEADLINE_S)
+    await asyncio.wait_for(stop(mqtt), DEADLINE_S)
+    await asyncio.wait_for(closed.wait(), DEADLINE_S)
+    assert mqtt.status.connects == 0
+    assert mqtt.status.error is None  # to be stopped is no failure
+    server.close()
+    await server.wait_closed()
+
+
+async def test_a_clean_goodbye_publishes_offline_once(broker, listen):
+    mqtt = publisher(config(broker.port, "once"))
+    async with listen(broker.port, "bikeped/once/availability") as live:
+        mqtt.start()
+        await live.until(lambda got: len(got) == 1)
+        await stop(mqtt)
+        # A will would come when the broker sees the connection end; a later client shows that.
+        later = publisher(config(broker.port, "once"))
+        later.start()
+        await live.until(lambda got: got[-1][1] == b"online" and len(got) > 2)
+        await stop(later)
+    assert live.payloads("availability")[:3] == [b"online", b"offline", b"online"]
 
 
 async def test_an_absent_broker_is_logged_once_and_tried_again(caplog, make_broker):
@@ -246,9 +285,9 @@ async def test_an_absent_broker_is_logged_once_and_tried_again(caplog, make_brok
             config(taken.getsockname()[1], "absent"), backoff_s=FAST, rng=Counting(1)
         )
         with caplog.at_level(logging.INFO):
-            await mqtt.start()
+            mqtt.start()
             await until(lambda: attempts >= 4)
-        await mqtt.stop()
+        await stop(mqtt)
     warnings = [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warnings) == 1
     assert "mqtt.host" in warnings[0].getMessage()
@@ -274,10 +313,10 @@ async def test_what_waited_is_sent_newest_values_first_then_the_queue_in_order(b
     mqtt.publish("state", b"SAFE", retain=True)
     mqtt.publish("state", b"ALERT", retain=True)
     async with listen(broker.port, "bikeped/waiting/#") as live:
-        await mqtt.start()
+        mqtt.start()
         await live.until(lambda got: len(got) == 5)
     assert [payload for _, payload, _ in live.received] == [b"ALERT", b"online", b"2", b"3", b"4"]
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 def test_the_pause_doubles_to_its_cap_with_jitter():
@@ -308,7 +347,7 @@ async def test_a_broker_that_wants_a_password(make_broker, listen, tmp_path):
     mqtt = publisher(
         config(broker.port, "secret", username="pole", password_file="secret"), base_dir=tmp_path
     )
-    await mqtt.start()
+    mqtt.start()
     await until(lambda: mqtt.status.error is not None)
     assert "mqtt.password_file" in (mqtt.status.error or "")
     assert mqtt.status.connects == 0
@@ -319,7 +358,7 @@ async def test_a_broker_that_wants_a_password(make_broker, listen, tmp_path):
     ) as live:
         await live.until(lambda got: len(got) == 1)
     assert live.payloads("availability") == [b"online"]
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 def openssl(*arguments: str | Path) -> None:
@@ -369,11 +408,11 @@ async def test_tls_with_a_client_certificate(make_broker, listen, tmp_path):
         key_file="client.key",
     )
     mqtt = publisher(settings, base_dir=tmp_path)
-    await mqtt.start()
+    mqtt.start()
     await connected(mqtt)
     mqtt.publish("state", b"x" * 200_000, retain=True, qos=1)  # more than one TLS record
     await until(lambda: mqtt.status.published == 1)
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 # paho leaves a socket whose handshake failed to the garbage collector, which closes it.
@@ -389,28 +428,28 @@ async def test_a_broker_that_an_unknown_authority_signed_is_refused(make_broker,
     other.mkdir()
     make_certificates(other)
     mqtt = publisher(config(broker.port, "forged", tls=True, ca_file="ca.crt"), base_dir=other)
-    await mqtt.start()
+    mqtt.start()
     await until(lambda: mqtt.status.error is not None)
     assert "certificate verify failed" in (mqtt.status.error or "")
     assert "mqtt.ca_file" in (mqtt.status.error or "")
     assert mqtt.status.connects == 0
-    await mqtt.stop()
+    await stop(mqtt)
 
 
 async def test_home_assistant_entities_are_announced_retained_only_when_asked(broker, listen):
     prefix = "ha-test"
     quiet = publisher(config(broker.port, "quiet", discovery_prefix=prefix))
-    await quiet.start()
+    quiet.start()
     await connected(quiet)
-    await quiet.stop()
+    await stop(quiet)
     mqtt = publisher(
         config(broker.port, "north", home_assistant=True, discovery_prefix=prefix), version="9.9"
     )
-    await mqtt.start()
+    mqtt.start()
     await connected(mqtt)
     async with listen(broker.port, f"{prefix}/#") as late:
         await late.until(lambda got: len(got) == 5)
-    await mqtt.stop()
+    await stop(mqtt)
     assert all(retained for _, _, retained in late.received)
     assert all("north" in topic for topic, _, _ in late.received)
     assert {json.loads(payload)["device"]["sw_version"] for _, payload, _ in late.received} == {
@@ -423,15 +462,15 @@ async def test_an_unforeseen_error_in_the_library_does_not_end_the_task(broker, 
     session = mqtt._session
     calls = 0
 
-    async def broken() -> None:
+    def broken() -> None:
         nonlocal calls
         calls += 1
         if calls < 3:
             raise RuntimeError("a bug")
-        await session()
+        session()
 
     monkeypatch.setattr(mqtt, "_session", broken)
-    await mqtt.start()
+    mqtt.start()
     await connected(mqtt)
     assert calls == 3
-    await mqtt.stop()
+    await stop(mqtt)

@@ -1,0 +1,137 @@
+"""One connection to the broker: paho's threaded client, with every wait bounded.
+
+paho's own reconnect is off: it has no jitter, starts its pauses anew at every CONNACK, does not say
+why a connection failed, and cannot take a renewed certificate. A connection here is used once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+from bikeped.config import MqttConfig
+from bikeped.telemetry.mqtt_auth import Credentials
+
+
+class MqttMessage(NamedTuple):
+    """A message with its full topic."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class BrokerRefusedError(OSError):
+    """The broker answered, and does not accept this client; the message says why."""
+
+
+class BrokerConnection:
+    """A connection to the broker of `config`, for one thread but for `abort`.
+
+    Every exchange may take `timeout_s`. What ends a connection is raised as an OSError by the call
+    under way or the next one. `will` is published by the broker when the connection is lost;
+    `on_lost` is called from paho's thread.
+    """
+
+    def __init__(
+        self,
+        config: MqttConfig,
+        credentials: Credentials,
+        *,
+        client_id: str,
+        timeout_s: float,
+        will: MqttMessage | None = None,
+        on_lost: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._config, self._timeout_s, self._on_lost = config, timeout_s, on_lost
+        self._changed = threading.Condition()  # guards the four below
+        self._accepted = False
+        self._published: set[int] = set()
+        self._error: OSError | None = None
+        self._ended = False
+        self._client = client = Client(
+            CallbackAPIVersion.VERSION2, client_id, reconnect_on_failure=False
+        )
+        client.connect_timeout = timeout_s
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_publish = self._on_publish
+        if credentials.username is not None:
+            client.username_pw_set(credentials.username, credentials.password)
+        if credentials.tls is not None:
+            client.tls_set_context(credentials.tls)
+        if will is not None:
+            client.will_set(*will)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the connection has ended."""
+        return self._ended
+
+    def open(self) -> None:
+        """Connects and waits until the broker has accepted the client. Raises OSError."""
+        self._client.connect(self._config.host, self._config.port, self._config.keepalive_s)
+        self._client.loop_start()
+        self._wait(lambda: self._accepted, "CONNACK")
+
+    def publish(self, message: MqttMessage) -> None:
+        """Sends a message and waits: QoS 0 until it is written to the socket, QoS 1 until the
+        broker has acknowledged it. Raises OSError."""
+        mid = self._client.publish(*message).mid
+        self._wait(lambda: mid in self._published, "PUBACK" if message.qos else "to take data")
+        with self._changed:
+            self._published.discard(mid)
+
+    def close(self) -> None:
+        """Says goodbye, so that the broker does not publish the will, and ends paho's thread."""
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def abort(self) -> None:
+        """Ends the connection now, whatever the broker does; callable from any thread."""
+        self._end(ConnectionAbortedError("the connection was given up"))
+        sock: Any = self._client.socket()
+        if sock is not None:
+            # Wakes paho's thread, which then closes the socket itself.
+            with contextlib.suppress(OSError):
+                socket.socket.shutdown(sock, socket.SHUT_RDWR)
+
+    def _wait(self, done: Callable[[], bool], what: str) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: done() or self._ended, self._timeout_s)
+            if self._ended:
+                raise self._error or ConnectionResetError("the connection was closed")
+            if not done():
+                raise TimeoutError(f"timed out waiting for the broker ({what})")
+
+    def _end(self, error: OSError) -> None:
+        with self._changed:
+            self._error = self._error or error
+            self._ended = True
+            self._changed.notify_all()
+        self._on_lost()
+
+    def _on_connect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _: Any) -> None:
+        with self._changed:
+            if reason.is_failure:
+                self._error = BrokerRefusedError(str(reason))
+            else:
+                self._accepted = True
+            self._changed.notify_all()
+
+    def _on_disconnect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _: Any) -> None:
+        said = str(reason)
+        known = "" if said in ("Unspecified error", "Normal disconnection") else f" ({said})"
+        self._end(ConnectionResetError(f"the connection was lost{known}"))
+
+    def _on_publish(self, _client: Client, _data: Any, mid: int, _reason: Any, _: Any) -> None:
+        with self._changed:
+            self._published.add(mid)
+            self._changed.notify_all()
