@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bikeped.detection.base import DetectorAnswer
+from bikeped.detection.base import DetectionResult
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.rendering.clip import read_sidecar
 from bikeped.pipeline.detection_stage import Picture
@@ -27,8 +27,8 @@ class OracleDetector:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return min(width, 640), min(height, 640)
 
-    def detect(self, picture: Picture) -> DetectorAnswer:
-        return DetectorAnswer(self._of(picture.frame.number), 0.0, 0.0, 0.0)
+    def detect(self, picture: Picture) -> DetectionResult:
+        return DetectionResult(self._of(picture.frame.number), 0.0, 0.0, 0.0)
 
 
 def clip_detector(sidecar: Path) -> OracleDetector:

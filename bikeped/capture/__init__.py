@@ -5,9 +5,9 @@
 """
 
 from bikeped.capture.base import FrameSource
+from bikeped.capture.frame_grabber import FrameGrabber
 from bikeped.capture.images import ImageSource
 from bikeped.capture.jpeg import JpegDecoder, read_size
-from bikeped.capture.latest import FrameGrabber
 from bikeped.capture.network import NetworkSource
 from bikeped.capture.paced import PacedSource
 from bikeped.capture.sources import open_source

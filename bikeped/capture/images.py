@@ -10,12 +10,12 @@ import numpy as np
 
 from bikeped.capture.base import FrameSource
 from bikeped.capture.jpeg import read_size
-from bikeped.capture.opencv import as_rgb, quiet, usable_fps
+from bikeped.capture.opencv import as_rgb, silence_opencv, usable_fps
 from bikeped.errors import CaptureError
 from bikeped.types import Frame, ImageArray
 
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
-PICTURE_SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp"}
+IMAGE_SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp"}
 
 
 class ImageSource(FrameSource):
@@ -34,12 +34,12 @@ class ImageSource(FrameSource):
             raise CaptureError(f"camera.fps: {fps} pictures a second cannot be shown; try 30")
         self.fps = fps
         try:
-            self._paths = picture_paths(folder)
+            self._paths = image_paths(folder)
         except OSError as error:
             raise CaptureError(f"{self.name}: cannot be read: {error.strerror}") from error
         if not self._paths:
             raise CaptureError(
-                f"{self.name}: holds no pictures ({', '.join(sorted(PICTURE_SUFFIXES))})"
+                f"{self.name}: holds no pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
             )
         self._number = 0
         self.width, self.height = _size(*_load(self._paths[0]), self._paths[0])
@@ -66,14 +66,14 @@ class ImageSource(FrameSource):
         self._number = len(self._paths)
 
 
-def picture_paths(path: Path) -> list[Path]:
+def image_paths(path: Path) -> list[Path]:
     """The pictures of a folder in natural order; a file is the only one of itself."""
     if not path.is_dir():
         return [path]
     found = [
         entry
         for entry in path.iterdir()
-        if entry.suffix.lower() in PICTURE_SUFFIXES and entry.is_file()
+        if entry.suffix.lower() in IMAGE_SUFFIXES and entry.is_file()
     ]
     return sorted(found, key=lambda entry: natural_key(entry.name))
 
@@ -92,7 +92,7 @@ def _load(path: Path) -> tuple[bytes | None, ImageArray | None]:
     if path.suffix.lower() in JPEG_SUFFIXES:
         return data, None
     try:
-        with quiet():
+        with silence_opencv():
             picture = (
                 cv2.imdecode(
                     np.frombuffer(data, np.uint8),

@@ -1,6 +1,6 @@
 """OpenCV's VideoCapture as this package uses it: opening, raw packets, colours.
 
-`Picture` is one picture as OpenCV gave it. `FfmpegReader` is the common part of recordings and
+`RawImage` is one picture as OpenCV gave it. `FfmpegReader` is the common part of recordings and
 network streams: Motion JPEG is handed on undecoded, everything else as RGB.
 """
 
@@ -40,7 +40,7 @@ OpenCapture = Callable[..., Capture]
 
 
 @dataclass(frozen=True)
-class Picture:
+class RawImage:
     """One picture: `jpeg` or `rgb` is set, as in Frame."""
 
     jpeg: bytes | None
@@ -68,7 +68,7 @@ def usable_fps(fps: float) -> bool:
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def silence_opencv() -> Iterator[None]:
     """Keeps OpenCV and FFmpeg from writing to standard error.
 
     What is wrong with a file is said by our own one line. A person's own setting is left alone;
@@ -125,7 +125,7 @@ class FfmpegReader:
         if first is None:
             self._capture.release()
             raise CaptureError(f"{label}: holds no picture that can be read; {mend}")
-        self._first: Picture | None = first
+        self._first: RawImage | None = first
         self.fps = self._capture.get(cv2.CAP_PROP_FPS)
         self.promised = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.width, self.height = self._size(first)
@@ -135,7 +135,7 @@ class FfmpegReader:
         """Whether pictures come as JPEG."""
         return self._raw
 
-    def read(self) -> Picture | None:
+    def read(self) -> RawImage | None:
         """The next picture, or None: the end of a file, or a stream that broke off."""
         if self._first is not None:
             first, self._first = self._first, None
@@ -149,7 +149,7 @@ class FfmpegReader:
 
     def _open(self) -> Capture:
         try:
-            with quiet():
+            with silence_opencv():
                 capture = self._open_capture(self._address, cv2.CAP_FFMPEG, self._params)
                 opened = capture.isOpened()
         except cv2.error as error:
@@ -171,7 +171,7 @@ class FfmpegReader:
             return False
         return bool(self._capture.set(cv2.CAP_PROP_FORMAT, -1))
 
-    def _whole_jpeg(self, picture: Picture | None) -> bool:
+    def _whole_jpeg(self, picture: RawImage | None) -> bool:
         if picture is None or picture.jpeg is None or not picture.jpeg.startswith(SOI):
             return False
         try:
@@ -183,12 +183,12 @@ class FfmpegReader:
         get = self._capture.get
         return int(get(cv2.CAP_PROP_FRAME_WIDTH)), int(get(cv2.CAP_PROP_FRAME_HEIGHT))
 
-    def _size(self, picture: Picture) -> tuple[int, int]:
+    def _size(self, picture: RawImage) -> tuple[int, int]:
         if picture.rgb is None:
             return self._promised_size()
         return picture.rgb.shape[1], picture.rgb.shape[0]
 
-    def _read(self) -> Picture | None:
+    def _read(self) -> RawImage | None:
         try:
             ok, data = self._capture.read()
         except cv2.error as error:
@@ -197,5 +197,5 @@ class FfmpegReader:
             return None
         media_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
         if self._raw:
-            return Picture(data.tobytes(), None, media_s)
-        return Picture(None, as_rgb(data), media_s)
+            return RawImage(data.tobytes(), None, media_s)
+        return RawImage(None, as_rgb(data), media_s)

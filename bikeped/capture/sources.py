@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from bikeped.capture.base import FrameSource
-from bikeped.capture.images import PICTURE_SUFFIXES, ImageSource
+from bikeped.capture.images import IMAGE_SUFFIXES, ImageSource
 from bikeped.capture.network import NetworkSource
 from bikeped.capture.v4l2 import V4l2Source
 from bikeped.capture.video import VideoSource
@@ -41,6 +41,6 @@ def open_source(
             f"{config_source}: no such file or folder; set camera.source to a camera "
             "(/dev/video0), a video, a folder of images or an rtsp:// or http:// address"
         )
-    if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES:
+    if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
         return ImageSource(path, fps=fps)
     return VideoSource(path)

@@ -21,7 +21,14 @@ import numpy as np
 
 from bikeped.capture.base import FrameSource
 from bikeped.capture.jpeg import EOI, read_size
-from bikeped.capture.opencv import Capture, OpenCapture, as_rgb, fourcc_text, quiet, usable_fps
+from bikeped.capture.opencv import (
+    Capture,
+    OpenCapture,
+    as_rgb,
+    fourcc_text,
+    silence_opencv,
+    usable_fps,
+)
 from bikeped.errors import CaptureError
 from bikeped.types import Frame, ImageArray
 
@@ -97,7 +104,7 @@ class V4l2Source(FrameSource):
 
     def _open(self, open_capture: OpenCapture) -> Capture:
         try:
-            with quiet():
+            with silence_opencv():
                 capture = open_capture(self.name, cv2.CAP_V4L2)
                 opened = capture.isOpened()
         except cv2.error as error:

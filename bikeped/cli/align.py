@@ -25,7 +25,7 @@ from bikeped.files import write_whole
 from bikeped.types import Frame
 
 if TYPE_CHECKING:
-    from bikeped.geometry.alignment import Alignment, Fit
+    from bikeped.geometry.alignment import Alignment, AlignmentFit
     from bikeped.web.align_points import Points
     from bikeped.web.align_save import Saved
 
@@ -105,7 +105,7 @@ def command(
             _print(found, saved)
     if json_path != "-" and grid_path is not None:
         click.echo(f"wrote {grid_path}")
-    return 1 if found is not None and found.strange else 0
+    return 1 if found is not None and found.outliers else 0
 
 
 def _read(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
@@ -175,45 +175,47 @@ def _draw(
     write_whole(target, cv2.imencode(target.suffix.lower(), drawn)[1].tobytes())
 
 
-def _save(loaded: LoadedConfig, found: Fit) -> Saved:
+def _save(loaded: LoadedConfig, found: AlignmentFit) -> Saved:
     from bikeped.web.align_save import file_hash, save
 
     path = Path(loaded.source)
-    values = {key: getattr(found.alignment, key) for key in found.error}
+    values = {key: getattr(found.alignment, key) for key in found.standard_errors}
     return save(path, values, file_hash(path))
 
 
-def _print(found: Fit, saved: Saved | None) -> None:
+def _print(found: AlignmentFit, saved: Saved | None) -> None:
     from rich.markup import escape
 
-    from bikeped.geometry.alignment import PARAMETERS
+    from bikeped.geometry.alignment import PARAMETER_NAMES
 
     screen = console()
     fitted = []
-    for key, error in found.error.items():
+    for key, error in found.standard_errors.items():
         value = getattr(found.alignment, key)
-        fitted.append((f"{PARAMETERS[key]} (camera.{key})", f"{value:.4f}", f"{error:.4f}"))
+        fitted.append((f"{PARAMETER_NAMES[key]} (camera.{key})", f"{value:.4f}", f"{error:.4f}"))
     screen.print(text_table(("", "fitted", "+/-"), fitted))
     residuals = [
         (
             r.mark,
-            r.what,
+            r.quantity,
             f"{r.measured_m:.2f}",
             f"{r.read_m:.2f}",
-            f"{100 * r.off_m:+.1f}",
-            "look again" if r.strange else "",
+            f"{100 * r.error_m:+.1f}",
+            "look again" if r.is_outlier else "",
         )
         for r in found.residuals
     ]
     columns = ("mark", "what", "measured m", "reads m", "off cm", "")
     screen.print(text_table(columns, residuals, align="llrrrl"))
-    if found.at_10m_error_m is not None:
-        screen.print(f"a mark at 10 m reads 10 m +/- {100 * found.at_10m_error_m:.0f} cm")
-    if not found.spare:
+    if found.standard_error_at_10m_m is not None:
+        screen.print(f"a mark at 10 m reads 10 m +/- {100 * found.standard_error_at_10m_m:.0f} cm")
+    if not found.redundancy:
         screen.print("no measurement is left over: nothing checks these numbers; add a mark")
-    if found.suspect is not None:
-        screen.print(f"the others agree without mark {escape(found.suspect)}: measure it again")
-    elif found.strange:
+    if found.suspect_mark is not None:
+        screen.print(
+            f"the others agree without mark {escape(found.suspect_mark)}: measure it again"
+        )
+    elif found.outliers:
         screen.print("the marks do not agree with one another: measure them again")
     if saved is not None:
         keys = ", ".join(f"camera.{key}" for key in saved.keys)

@@ -9,7 +9,7 @@ from bikeped.types import Detections, ImageArray
 
 
 @dataclass(frozen=True)
-class DetectorAnswer:
+class DetectionResult:
     """What was found in one frame, and how long each stage took, in milliseconds."""
 
     detections: Detections
@@ -48,7 +48,7 @@ class Detector(Protocol):
         """
         ...
 
-    def infer(self, rgb: ImageArray, frame_width: int, frame_height: int) -> DetectorAnswer:
+    def infer(self, rgb: ImageArray, frame_width: int, frame_height: int) -> DetectionResult:
         """Detections in `rgb` [h, w, 3] uint8, a frame decoded at any scale.
 
         Boxes are in pixels of the full frame of `frame_width` x `frame_height`, clipped to it; most

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.detection.base import DetectorAnswer
+from bikeped.detection.base import DetectionResult
 from bikeped.detection.classes import UNMAPPED, class_names, kind_table, riders_are_whole
 from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.detection.nms import non_max_suppression, vote_boxes
@@ -163,7 +163,7 @@ class NetworkDetector:
         high = math.floor(box.height * frame_height / (y2 - y1) + 1e-6)
         return min(wide, frame_width), min(high, frame_height)
 
-    def infer(self, rgb: ImageArray, frame_width: int, frame_height: int) -> DetectorAnswer:
+    def infer(self, rgb: ImageArray, frame_width: int, frame_height: int) -> DetectionResult:
         """See `Detector.infer`."""
         start = time.perf_counter()
         where = self._preprocess(rgb, frame_width, frame_height)
@@ -182,7 +182,7 @@ class NetworkDetector:
         )
         found = self._road_users(candidates, where)
         end = time.perf_counter()
-        return DetectorAnswer(
+        return DetectionResult(
             found, (filled - start) * 1e3, (answered - filled) * 1e3, (end - answered) * 1e3
         )
 

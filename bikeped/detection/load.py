@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bikeped.detection.base import Detector
-from bikeped.detection.model_hash import checked_sha256
+from bikeped.detection.model_hash import verify_sha256
 from bikeped.errors import DetectorError
 from bikeped.models import model_file
 from bikeped.types import Region
@@ -33,11 +33,11 @@ def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None =
         from bikeped.detection.onnx_runtime import OnnxDetector, runs_on_cpu
 
         path = model_file(config.model, base_dir, on_cpu=runs_on_cpu(config.providers))
-        return OnnxDetector(path, config, checked_sha256(path, config.sha256), road)
+        return OnnxDetector(path, config, verify_sha256(path, config.sha256), road)
     if path.suffix.lower() == ".engine":
         from bikeped.detection.trt_engine import EngineDetector
 
-        return EngineDetector(path, config, checked_sha256(path, config.sha256), road=road)
+        return EngineDetector(path, config, verify_sha256(path, config.sha256), road=road)
     raise DetectorError(
         f"detection.model: {path} is neither .onnx nor .engine; export the model to one of them"
     )

@@ -29,7 +29,7 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def checked_sha256(path: Path, expected: str | None) -> str:
+def verify_sha256(path: Path, expected: str | None) -> str:
     """The file's hash; raises `DetectorError` where `detection.sha256` expects another."""
     actual = sha256_of(path)
     if expected is not None and expected.lower() != actual:

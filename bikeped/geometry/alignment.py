@@ -1,4 +1,4 @@
-"""The numbers that an installer sets, marks that he measured, and what a pixel reads. Pure."""
+"""Camera alignment: its parameters, measured ground marks, and the result of a fit. Pure."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from bikeped.errors import GeometryError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.lens import Lens
 
-#: What may be fitted, as the keys of the camera section are called, and how people say it.
-PARAMETERS = {
+#: Parameters that can be fitted: keys of the camera section and their names in messages.
+PARAMETER_NAMES = {
     "height_m": "height",
     "pitch_deg": "pitch",
     "radius_px": "radius",
@@ -20,17 +20,17 @@ PARAMETERS = {
     "cy": "centre v",
     "heading_deg": "heading",
 }
-#: One natural unit of each; of the radius and the centre as a share of the radius.
-_UNIT = {"height_m": 0.1, "pitch_deg": 1.0, "heading_deg": 1.0}
-_SHARE = 0.01
+#: Parameter scales; those of the radius and the centre are a share of the radius.
+_SCALE = {"height_m": 0.1, "pitch_deg": 1.0, "heading_deg": 1.0}
+_RADIUS_SHARE = 0.01
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """The installer's numbers; `radius_px`, `cx`, `cy` in crop pixels.
+    """Mounting parameters of a camera; `radius_px`, `cx`, `cy` in crop pixels.
 
-    `radius_px` is the image circle's radius of the projection without its radial terms, as
-    `Lens.from_circle` and the key `camera.radius_px` have it.
+    `radius_px` is the radius of the image circle without the radial terms, as in
+    `Lens.from_circle` and the key `camera.radius_px`.
     """
 
     height_m: float
@@ -42,7 +42,7 @@ class Alignment:
 
     @staticmethod
     def of(camera: GroundCamera) -> Alignment:
-        """The numbers of a camera."""
+        """The parameters of `camera`."""
         return Alignment(
             height_m=camera.height_m,
             pitch_deg=camera.pitch_deg,
@@ -53,13 +53,13 @@ class Alignment:
         )
 
     def camera(self, like: GroundCamera) -> GroundCamera:
-        """The camera `like` with these numbers; GeometryError when there is none."""
+        """`like` with these parameters; GeometryError where they give no camera."""
         if not (math.isfinite(self.radius_px) and self.radius_px > 0):
-            raise GeometryError(f"radius_px: {self.radius_px} is no radius; use a positive number")
-        was_px = plain_radius_px(like.lens)
+            raise GeometryError(f"radius_px: {self.radius_px} must be a positive number")
+        old_px = plain_radius_px(like.lens)
         lens = like.lens
-        if self.radius_px != was_px:
-            lens = replace(lens, focal_px=lens.focal_px * self.radius_px / was_px)
+        if self.radius_px != old_px:
+            lens = replace(lens, focal_px=lens.focal_px * self.radius_px / old_px)
         return replace(
             like,
             lens=lens,
@@ -70,23 +70,23 @@ class Alignment:
             heading_deg=self.heading_deg,
         )
 
-    def unit(self, name: str) -> float:
-        """A step of a parameter that a person would call small."""
-        return _UNIT.get(name, _SHARE * self.radius_px)
+    def scale(self, name: str) -> float:
+        """A small step of a parameter: 0.1 m, 1 degree, or 1 % of the radius."""
+        return _SCALE.get(name, _RADIUS_SHARE * self.radius_px)
 
 
 def plain_radius_px(lens: Lens) -> float:
-    """Radius at the edge of the field of view without the radial terms."""
+    """Image radius at the edge of the field of view, without the radial terms."""
     fov_deg = math.degrees(2 * lens.max_theta_rad)
     return lens.focal_px / Lens.from_circle(lens.projection, 1.0, fov_deg).focal_px
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A point on the ground: its crop pixel, and what was measured, metres.
+    """A point on the ground: its crop pixel and its measured position, metres.
 
-    `distance_m` is from the foot of the pole (below the lens); `forward_m` and `right_m` are along
-    and across the ground frame's x axis. Distance or forward must be given.
+    `distance_m` is from the point below the lens; `forward_m` and `right_m` are ground coordinates
+    (x, y). Distance or forward must be given. Raises GeometryError for contradictory measurements.
     """
 
     name: str
@@ -106,7 +106,7 @@ class Mark:
             )
         if None not in given:
             raise GeometryError(
-                f"mark {self.name}: distance_m, forward_m and right_m are one too many; leave "
+                f"mark {self.name}: distance_m, forward_m and right_m over-determine it; leave "
                 "out distance_m or forward_m"
             )
         if self.distance_m is None:
@@ -125,7 +125,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Spacing:
-    """The measured distance between two marks, by their index."""
+    """The measured distance between the marks with the indices `first` and `second`."""
 
     first: int
     second: int
@@ -133,8 +133,8 @@ class Spacing:
 
 
 @dataclass(frozen=True)
-class Accuracy:
-    """Standard errors of what people do: laying a tape, and setting a mark in the picture."""
+class MeasurementAccuracy:
+    """Standard errors of a tape measurement and of a mark placed in the picture."""
 
     tape_m: float = 0.02
     mark_px: float = 2.0
@@ -142,44 +142,47 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Residual:
-    """One measurement: what it was, what the fitted camera reads, what it may be off, metres."""
+    """One measurement beside the value that the fitted camera gives for it, metres."""
 
     mark: str  #: name of the mark, or of two, as `1-2`
-    what: str  #: distance, forward, right, spacing
+    quantity: str  #: distance, forward, right, spacing
     measured_m: float
-    read_m: float
-    expected_m: float  #: standard error that tape and pixel explain
+    read_m: float  #: by the fitted camera
+    standard_error_m: float  #: that tape and pixel explain
 
     @property
-    def off_m(self) -> float:
+    def error_m(self) -> float:
         """Read minus measured."""
         return self.read_m - self.measured_m
 
     @property
-    def strange(self) -> bool:
-        """Whether it is more than tape and pixel explain."""
-        return abs(self.off_m) > 4 * self.expected_m
+    def is_outlier(self) -> bool:
+        """Whether the error exceeds four standard errors."""
+        return abs(self.error_m) > 4 * self.standard_error_m
 
 
 @dataclass(frozen=True)
-class Fit:
-    """A fitted alignment; `error` has the standard error of every fitted parameter."""
+class AlignmentFit:
+    """A fitted alignment with the standard error of every fitted parameter."""
 
     alignment: Alignment
-    error: dict[str, float]
+    standard_errors: dict[str, float]
     residuals: tuple[Residual, ...]
-    spare: int  #: measurements beyond those that the fit needs
-    at_10m_error_m: float | None  #: standard error of what reads 10 m; None: 10 m is not in view
-    suspect: str | None = None  #: the one mark without which the others agree, if there is one
+    redundancy: int  #: measurements minus fitted parameters
+    standard_error_at_10m_m: float | None  #: of a point at 10 m; None: 10 m is not in view
+    suspect_mark: str | None = None  #: the mark without which all others agree, if there is one
 
     @property
-    def strange(self) -> tuple[Residual, ...]:
-        """Measurements that do not go with the others."""
-        return tuple(r for r in self.residuals if r.strange)
+    def outliers(self) -> tuple[Residual, ...]:
+        """Measurements that disagree with the others."""
+        return tuple(r for r in self.residuals if r.is_outlier)
 
 
-def ten_metre_pixel(camera: GroundCamera, distance_m: float = 10.0) -> tuple[float, float] | None:
-    """Crop pixel of a point at `distance_m`: straight ahead, or else as near to that as is seen."""
+def pixel_at_distance(camera: GroundCamera, distance_m: float = 10.0) -> tuple[float, float] | None:
+    """Crop pixel of a ground point at `distance_m`, at the smallest bearing that is in view.
+
+    None where the camera sees no point at that distance.
+    """
     bearings = np.radians([0, *(s * b for b in range(5, 95, 5) for s in (1, -1))])
     heading = math.radians(camera.heading_deg)
     around = distance_m * np.stack([np.cos(bearings + heading), np.sin(bearings + heading)], axis=1)
@@ -190,7 +193,7 @@ def ten_metre_pixel(camera: GroundCamera, distance_m: float = 10.0) -> tuple[flo
     return u, v
 
 
-def reading_m(camera: GroundCamera, uv_px: tuple[float, float]) -> float | None:
-    """Distance from the foot of the pole that a crop pixel reads; None on or above the horizon."""
+def ground_distance_m(camera: GroundCamera, uv_px: tuple[float, float]) -> float | None:
+    """Distance of a crop pixel's ground point from the foot of the pole; None above the horizon."""
     xy, valid = camera.ground([uv_px])
     return float(np.hypot(*xy[0])) if valid[0] else None

@@ -1,11 +1,11 @@
-"""How a camera hangs, from marks on the ground whose distances were measured with a tape.
+"""Fits a camera's height and direction to ground marks with measured distances.
 
-Least squares over the deployed geometry itself (`GroundCamera.ground`): each measurement is held
-against what the camera reads at the mark's pixel. Near the horizon a pixel is tens of centimetres
-on the ground, so errors are weighted by what tape and finger can do: the covariance of the
-differences is tape^2 I + px^2 G G^T, G being how each reading moves with the pixels of the marks
-(first-order orthogonal distance regression; Boggs and Rogers 1990). Levenberg-Marquardt from the
-start values and from a fan of pitches, so a wrong start does not matter. Pure.
+Least squares over the deployed geometry (`GroundCamera.ground`): each measurement is compared with
+the camera's reading at the mark's pixel. Near the horizon a pixel covers tens of centimetres of
+ground, so residuals are weighted by tape and pixel accuracy: their covariance is
+tape^2 I + px^2 G G^T, where G is the derivative of the readings by the marks' pixels (first-order
+orthogonal distance regression; Boggs and Rogers 1990). Levenberg-Marquardt starts from the current
+values and from a grid of pitches, so a wrong start does not matter. Pure.
 """
 
 from __future__ import annotations
@@ -18,46 +18,46 @@ import numpy as np
 
 from bikeped.errors import GeometryError
 from bikeped.geometry.alignment import (
-    PARAMETERS,
-    Accuracy,
+    PARAMETER_NAMES,
     Alignment,
-    Fit,
+    AlignmentFit,
     Mark,
+    MeasurementAccuracy,
     Residual,
     Spacing,
-    reading_m,
-    ten_metre_pixel,
+    ground_distance_m,
+    pixel_at_distance,
 )
 from bikeped.geometry.camera import GroundCamera
 from bikeped.types import FloatArray
 
-#: A standard error beyond this many units means that the marks do not determine the number.
+#: A parameter is undetermined where its standard error exceeds this many of its scales.
 _LIMIT = {"height_m": 3.0, "pitch_deg": 2.0, "radius_px": 3.0, "cx": 4.0, "cy": 4.0}
 _LIMIT_HEADING = 5.0
-_STEPS = 60
+_MAX_ITERATIONS = 60
 
 
-def fit(
+def fit_alignment(
     camera: GroundCamera,
     marks: Sequence[Mark],
     spacings: Sequence[Spacing] = (),
     free: Sequence[str] = ("height_m", "pitch_deg"),
-    accuracy: Accuracy | None = None,
-) -> Fit:
-    """The alignment that explains the measurements best; what is not `free` stays `camera`'s.
+    accuracy: MeasurementAccuracy | None = None,
+) -> AlignmentFit:
+    """The alignment that fits the measurements best; parameters not in `free` stay `camera`'s.
 
-    Raises GeometryError, saying what to measure, when the marks do not determine the answer.
+    Raises GeometryError, naming what to measure, when the marks do not determine the parameters.
     """
-    unknown = [name for name in free if name not in PARAMETERS]
+    unknown = [name for name in free if name not in PARAMETER_NAMES]
     if unknown or not free or len(set(free)) < len(free):
         raise GeometryError(
             f"free: {', '.join(unknown) or 'nothing, or a name twice'}; use some of "
-            f"{', '.join(PARAMETERS)}"
+            f"{', '.join(PARAMETER_NAMES)}"
         )
-    problem = _Problem(camera, marks, spacings, tuple(free), accuracy or Accuracy())
+    problem = _Problem(camera, marks, spacings, tuple(free), accuracy or MeasurementAccuracy())
     problem.check()
-    ends = [problem.descend(start) for start in problem.starts()]
-    found = sorted(((*problem.costs(end), end) for end in ends), key=lambda answer: answer[0])
+    solutions = [problem.minimise(start) for start in problem.starts()]
+    found = sorted(((*problem.costs(x), x) for x in solutions), key=lambda answer: answer[0])
     if not found:
         raise GeometryError(
             "no pitch puts every mark on the ground: is each on flat ground, below the horizon, "
@@ -66,22 +66,22 @@ def fit(
     _, cost, best = found[0]
     covariance = problem.covariance(best, cost)
     error = dict(zip(free, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    problem.check_single([(score, end) for score, _, end in found], error)
-    answer = Fit(
+    problem.check_unique([(score, x) for score, _, x in found], error)
+    answer = AlignmentFit(
         alignment=best,
-        error=error,
+        standard_errors=error,
         residuals=problem.residuals(best),
-        spare=problem.count - len(free),
-        at_10m_error_m=problem.at_10m_error(best, covariance),
+        redundancy=problem.count - len(free),
+        standard_error_at_10m_m=problem.standard_error_at_10m(best, covariance),
     )
-    if not answer.strange:
+    if not answer.outliers:
         return answer
-    return replace(answer, suspect=_suspect(problem, spacings, cost))
+    return replace(answer, suspect_mark=_suspect_mark(problem, spacings, cost))
 
 
-def _suspect(problem: _Problem, spacings: Sequence[Spacing], cost: float) -> str | None:
-    """The mark without which the others agree; least squares smears its fault over all of them."""
-    marks, found = problem.marks, []
+def _suspect_mark(problem: _Problem, spacings: Sequence[Spacing], cost: float) -> str | None:
+    """The mark without which the others agree; least squares spreads its error over all marks."""
+    marks, candidates = problem.marks, []
     for i, mark in enumerate(marks):
         kept = [
             Spacing(s.first - (s.first > i), s.second - (s.second > i), s.distance_m)
@@ -89,16 +89,16 @@ def _suspect(problem: _Problem, spacings: Sequence[Spacing], cost: float) -> str
             if i not in (s.first, s.second)
         ]
         rest = [*marks[:i], *marks[i + 1 :]]
-        less = _Problem(problem.like, rest, kept, problem.free, problem.accuracy)
-        if less.count > len(problem.free):
-            squares = (less.costs(less.descend(start))[1] for start in less.starts())
-            found.append((min(squares, default=math.inf), mark.name))
-    best = min(found, default=(math.inf, ""))
+        fewer = _Problem(problem.like, rest, kept, problem.free, problem.accuracy)
+        if fewer.count > len(problem.free):
+            squares = (fewer.costs(fewer.minimise(start))[1] for start in fewer.starts())
+            candidates.append((min(squares, default=math.inf), mark.name))
+    best = min(candidates, default=(math.inf, ""))
     return best[1] if best[0] < 0.2 * cost else None
 
 
 class _Problem:
-    """Marks and spacings as a system of equations."""
+    """The weighted least-squares problem of the marks and spacings."""
 
     def __init__(
         self,
@@ -106,16 +106,16 @@ class _Problem:
         marks: Sequence[Mark],
         spacings: Sequence[Spacing],
         free: tuple[str, ...],
-        accuracy: Accuracy,
+        accuracy: MeasurementAccuracy,
     ) -> None:
         self.like, self.marks, self.free, self.accuracy = camera, marks, free, accuracy
         self.uv_px = np.array([[m.u_px, m.v_px] for m in marks], np.float64).reshape(-1, 2)
         rows: list[tuple[str, str, int, int, float]] = []
         for i, mark in enumerate(marks):
-            for what in ("distance", "forward", "right"):
-                value = getattr(mark, f"{what}_m")
+            for quantity in ("distance", "forward", "right"):
+                value = getattr(mark, f"{quantity}_m")
                 if value is not None:
-                    rows.append((mark.name, what, i, i, float(value)))
+                    rows.append((mark.name, quantity, i, i, float(value)))
         for spacing in spacings:
             i, j = spacing.first, spacing.second
             if not (0 <= i < len(marks) and 0 <= j < len(marks)) or i == j:
@@ -135,12 +135,12 @@ class _Problem:
         return len(self.rows)
 
     def check(self) -> None:
-        """Raises GeometryError for what no descent can mend."""
+        """Raises GeometryError for marks that no fit can use."""
         if self.count < len(self.free):
             names = _names(self.free)
             raise GeometryError(
                 f"{self.count} measurement{'s' * (self.count != 1)} cannot determine "
-                f"{len(self.free)} numbers ({names}): add "
+                f"{len(self.free)} parameters ({names}): add "
                 f"{len(self.free) - self.count} more, better two or three"
             )
         for i, mark in enumerate(self.marks):
@@ -157,10 +157,10 @@ class _Problem:
                     "move it, or correct radius and centre first"
                 )
 
-    def read(self, alignment: Alignment) -> tuple[FloatArray, FloatArray] | None:
-        """What the camera reads for each row [m], and how it moves with each pixel [m, 2n].
+    def predict(self, alignment: Alignment) -> tuple[FloatArray, FloatArray] | None:
+        """The camera's reading of each measurement [m], and its derivative by mark pixels [m, 2n].
 
-        None when a mark is not on the ground, or the numbers make no camera.
+        None when a mark is not on the ground, or the parameters give no camera.
         """
         try:
             camera = alignment.camera(self.like)
@@ -174,36 +174,36 @@ class _Problem:
         n = len(self.marks)
         value = np.empty(self.count)
         slope = np.zeros((self.count, 2 * n))
-        for row, (_, what, i, j, _) in enumerate(self.rows):
-            for k, other in ((i, j), (j, i)) if what == "spacing" else ((i, i),):
-                reads = _measure(what, xy[k], xy[other, 0])
+        for row, (_, quantity, i, j, _) in enumerate(self.rows):
+            for k, other in ((i, j), (j, i)) if quantity == "spacing" else ((i, i),):
+                reads = _measure(quantity, xy[k], xy[other, 0])
                 value[row] = reads[0]
                 slope[row, 2 * k] = (reads[1] - reads[2]) / (2 * step)
                 slope[row, 2 * k + 1] = (reads[3] - reads[4]) / (2 * step)
         return value, slope
 
-    def spread(self, slope: FloatArray) -> FloatArray:
-        """Covariance [m, m] of the differences, from tape and pixel."""
+    def residual_covariance(self, slope: FloatArray) -> FloatArray:
+        """Covariance [m, m] of the residuals, from tape and pixel."""
         tape, mark = self.accuracy.tape_m, self.accuracy.mark_px
         return np.asarray(tape**2 * np.eye(self.count) + mark**2 * slope @ slope.T)
 
     def starts(self) -> list[Alignment]:
-        """The camera's own numbers, and a fan of pitches (and headings), best first, at most four.
+        """The camera's own values and a grid of pitches (and headings): the best four, best first.
 
-        Positions grow in proportion to the height, so each pitch has its height at once.
+        Positions are proportional to the height, which gives each pitch its height directly.
         """
         own = Alignment.of(self.like)
-        fan = [own]
+        grid = [own]
         pitches = range(-85, 45, 5) if "pitch_deg" in self.free else [own.pitch_deg]
         headings = range(-180, 180, 45) if "heading_deg" in self.free else [0]
-        fan += [
-            replace(own, pitch_deg=float(pitch), heading_deg=own.heading_deg + turn)
+        grid += [
+            replace(own, pitch_deg=float(pitch), heading_deg=own.heading_deg + offset)
             for pitch in pitches
-            for turn in headings
+            for offset in headings
         ]
         found = []
-        for start in fan:
-            answer = self.read(start)
+        for start in grid:
+            answer = self.predict(start)
             if answer is None:
                 continue
             if "height_m" in self.free:
@@ -217,44 +217,44 @@ class _Problem:
         return [start for score, start in found[:4] if math.isfinite(score)]
 
     def costs(self, alignment: Alignment) -> tuple[float, float]:
-        """Minus twice the log likelihood (but for a constant), and the weighted sum of squares.
+        """Minus twice the log likelihood (up to a constant), and the weighted sum of squares.
 
-        Two places are compared by the likelihood: near the horizon nothing is precise, and every
-        sum of squares small. Infinite where there is no answer.
+        Solutions are compared by the likelihood: near the horizon nothing is precise, and every
+        sum of squares is small. Infinite where there is no reading.
         """
-        answer = self.read(alignment)
+        answer = self.predict(alignment)
         if answer is None:
             return math.inf, math.inf
-        off, spread = answer[0] - self.measured_m, self.spread(answer[1])
-        squares = float(off @ np.linalg.solve(spread, off))
-        return squares + float(np.linalg.slogdet(spread)[1]), squares
+        residual, covariance = answer[0] - self.measured_m, self.residual_covariance(answer[1])
+        squares = float(residual @ np.linalg.solve(covariance, residual))
+        return squares + float(np.linalg.slogdet(covariance)[1]), squares
 
-    def descend(self, start: Alignment) -> Alignment:
-        """Where Levenberg-Marquardt ends, with weights that follow the estimate.
+    def minimise(self, start: Alignment) -> Alignment:
+        """Levenberg-Marquardt from `start`, reweighted at every step.
 
-        Weights are held during a step: were they part of the cost, it could be lowered by moving
+        Weights are constant within a step: as part of the cost they would lower it by moving
         marks toward the horizon, where nothing is precise.
         """
         here, damping = start, 1e-3
-        for _ in range(_STEPS):
-            answer = self.read(here)
+        for _ in range(_MAX_ITERATIONS):
+            answer = self.predict(here)
             if answer is None:
                 break
-            weight = np.linalg.inv(np.linalg.cholesky(self.spread(answer[1])))
-            off = weight @ (answer[0] - self.measured_m)
-            slope = self.slopes(here)
-            if slope is None:
+            weight = np.linalg.inv(np.linalg.cholesky(self.residual_covariance(answer[1])))
+            residual = weight @ (answer[0] - self.measured_m)
+            jacobian = self.jacobian(here)
+            if jacobian is None:
                 break
-            slope = weight @ slope
-            normal, pull = slope.T @ slope, slope.T @ off
+            jacobian = weight @ jacobian
+            normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
             while damping < 1e9:
                 damped = normal + damping * np.diag(np.diag(normal) + 1e-12)
-                step = -np.linalg.solve(damped, pull)
-                there = self.moved(here, np.clip(step, -10, 10))
-                tried = self.read(there)
+                step = -np.linalg.solve(damped, gradient)
+                there = self.stepped(here, np.clip(step, -10, 10))
+                tried = self.predict(there)
                 if tried is not None:
-                    now = weight @ (tried[0] - self.measured_m)
-                    if now @ now <= off @ off:
+                    new_residual = weight @ (tried[0] - self.measured_m)
+                    if new_residual @ new_residual <= residual @ residual:
                         break
                 damping *= 4
             else:
@@ -265,134 +265,133 @@ class _Problem:
                 break
         return here
 
-    def moved(self, alignment: Alignment, units: FloatArray) -> Alignment:
-        """The alignment some units of each free parameter away."""
+    def stepped(self, alignment: Alignment, steps: FloatArray) -> Alignment:
+        """`alignment` with each free parameter changed by `steps` [p] of its scales."""
         to = {
-            name: getattr(alignment, name) + float(by) * alignment.unit(name)
-            for name, by in zip(self.free, units, strict=True)
+            name: getattr(alignment, name) + float(by) * alignment.scale(name)
+            for name, by in zip(self.free, steps, strict=True)
         }
         return replace(alignment, **to)
 
-    def slopes(self, alignment: Alignment) -> FloatArray | None:
-        """How the readings move with a unit of each free parameter [m, p], by differences."""
+    def jacobian(self, alignment: Alignment) -> FloatArray | None:
+        """Derivative [m, p] of the readings by the scaled free parameters; central differences."""
         columns = []
         for k in range(len(self.free)):
             step = np.zeros(len(self.free))
             step[k] = 1e-4
-            up = self.read(self.moved(alignment, step))
-            down = self.read(self.moved(alignment, -step))
+            up = self.predict(self.stepped(alignment, step))
+            down = self.predict(self.stepped(alignment, -step))
             if up is None or down is None:
                 return None
             columns.append((up[0] - down[0]) / 2e-4)
         return np.stack(columns, axis=1)
 
     def covariance(self, best: Alignment, cost: float) -> FloatArray:
-        """Covariance of the free parameters; GeometryError when they are not determined.
+        """Covariance [p, p] of the free parameters; GeometryError when they are not determined.
 
-        Larger than tape and pixel say where the spare measurements disagree by more than that.
+        Scaled up where redundant measurements disagree by more than tape and pixel explain.
         """
-        answer, slope = self.read(best), self.slopes(best)
-        if answer is None or slope is None:
+        answer, jacobian = self.predict(best), self.jacobian(best)
+        if answer is None or jacobian is None:
             raise GeometryError(
-                "the best answer lies at the edge of what is possible: check the marks "
+                "the best fit lies at the edge of the possible range: check the marks "
                 "and their distances"
             )
-        weight = np.linalg.inv(np.linalg.cholesky(self.spread(answer[1])))
-        _, size, axes = np.linalg.svd(weight @ slope, full_matrices=False)
+        weight = np.linalg.inv(np.linalg.cholesky(self.residual_covariance(answer[1])))
+        _, size, axes = np.linalg.svd(weight @ jacobian, full_matrices=False)
         limits = np.array([_LIMIT.get(name, _LIMIT_HEADING) for name in self.free])
         inverse = 1 / np.maximum(size, 1e-9)
-        error = np.sqrt(((axes.T * inverse) ** 2).sum(axis=1))  # in units
+        error = np.sqrt(((axes.T * inverse) ** 2).sum(axis=1))  # in scales
         if (error > limits).any():
             weak = np.abs(axes[-1] / limits)
             loose = [n for n, w in zip(self.free, weak, strict=True) if w > 0.3 * weak.max()]
             raise GeometryError(self._undetermined(loose, best, error))
-        spare = self.count - len(self.free)
-        scale = max(1.0, cost / spare) if spare > 0 else 1.0
-        units = np.array([best.unit(name) for name in self.free])
-        basis = (axes.T * inverse) * units[:, None]
+        redundancy = self.count - len(self.free)
+        scale = max(1.0, cost / redundancy) if redundancy > 0 else 1.0
+        scales = np.array([best.scale(name) for name in self.free])
+        basis = (axes.T * inverse) * scales[:, None]
         return np.asarray(scale * basis @ basis.T)
 
     def _undetermined(self, loose: list[str], best: Alignment, error: FloatArray) -> str:
-        by = dict(zip(self.free, error, strict=True))
-        worst = max(loose, key=lambda name: by[name])
-        size = by[worst] * best.unit(worst)
+        errors = dict(zip(self.free, error, strict=True))
+        worst = max(loose, key=lambda name: errors[name])
+        size = errors[worst] * best.scale(worst)
         doubt = f"{size:.2g}" if size < 1000 else "any"
         unit = {"m": " m", "deg": " degrees", "px": " px"}.get(worst.rpartition("_")[2], " px")
-        if len(loose) > 1:
-            said = f"these marks do not tell {_names(loose)} apart"
-        else:
-            said = f"these marks do not determine the {PARAMETERS[loose[0]]}"
-        said += f" ({PARAMETERS[worst]} +/- {doubt}{unit}): "
+        text = (
+            f"these marks do not tell {_names(loose)} apart"
+            if len(loose) > 1
+            else f"these marks do not determine the {_names(loose)}"
+        ) + f" ({PARAMETER_NAMES[worst]} +/- {doubt}{unit}): "
         if set(loose) <= {"height_m", "pitch_deg"}:
-            return said + "add marks nearer and farther, for example at 4 m and at 15 m"
+            return text + "add marks nearer and farther, for example at 4 m and at 15 m"
         if loose == ["heading_deg"]:
-            return said + "measure how far the marks lie to the right, or leave the heading out"
-        return said + (
+            return text + "measure how far the marks lie to the right, or leave the heading out"
+        optional = _names([n for n in loose if n not in ("height_m", "pitch_deg")])
+        return text + (
             "add marks near, far and to both sides, with how far they lie to the right, or leave "
-            f"{' and '.join(PARAMETERS[n] for n in loose if n not in ('height_m', 'pitch_deg'))} "
-            "as the calibration has it"
+            f"{optional} as the calibration has it"
         )
 
-    def check_single(
+    def check_unique(
         self, found: Sequence[tuple[float, Alignment]], error: dict[str, float]
     ) -> None:
-        """Raises GeometryError when another answer fits (nearly) as well as the best."""
+        """Raises GeometryError when a different solution fits nearly as well as the best."""
         score, best = found[0]
         for other_score, other in found[1:]:
             apart = any(
                 abs(getattr(other, name) - getattr(best, name))
-                > max(6 * error[name], 0.3 * best.unit(name))
+                > max(6 * error[name], 0.3 * best.scale(name))
                 for name in self.free
             )
             if apart and other_score < score + 4:
-                raise GeometryError(
-                    f"two answers fit: {_said(best, self.free)}, or {_said(other, self.free)}; "
-                    "add a mark at another distance"
-                )
+                both = " or ".join(_values_text(x, self.free) for x in (best, other))
+                raise GeometryError(f"two solutions fit: {both}; add a mark at another distance")
 
     def residuals(self, best: Alignment) -> tuple[Residual, ...]:
-        """Each measurement beside what the camera reads."""
-        answer = self.read(best)
+        """Each measurement beside the camera's reading."""
+        answer = self.predict(best)
         if answer is None:  # checked by `covariance`
             return ()
-        expected = np.sqrt(np.diag(self.spread(answer[1])))
+        expected = np.sqrt(np.diag(self.residual_covariance(answer[1])))
         return tuple(
-            Residual(name, what, measured, float(read), float(may))
-            for (name, what, _, _, measured), read, may in zip(
+            Residual(name, quantity, measured, float(read), float(sigma))
+            for (name, quantity, _, _, measured), read, sigma in zip(
                 self.rows, answer[0], expected, strict=True
             )
         )
 
-    def at_10m_error(self, best: Alignment, covariance: FloatArray) -> float | None:
-        """Standard error of the distance that the pixel of a 10 m mark reads."""
-        pixel = ten_metre_pixel(best.camera(self.like))
+    def standard_error_at_10m(self, best: Alignment, covariance: FloatArray) -> float | None:
+        """Standard error of the distance read at the pixel of a 10 m point; None: not in view."""
+        pixel = pixel_at_distance(best.camera(self.like))
         if pixel is None:
             return None
         slope = np.zeros(len(self.free))
         for k, name in enumerate(self.free):
             step = np.zeros(len(self.free))
             step[k] = 1e-3
-            up = reading_m(self.moved(best, step).camera(self.like), pixel)
-            down = reading_m(self.moved(best, -step).camera(self.like), pixel)
+            up = ground_distance_m(self.stepped(best, step).camera(self.like), pixel)
+            down = ground_distance_m(self.stepped(best, -step).camera(self.like), pixel)
             if up is None or down is None:
                 return None
-            slope[k] = (up - down) / 2e-3 / best.unit(name)
+            slope[k] = (up - down) / 2e-3 / best.scale(name)
         return float(np.sqrt(slope @ covariance @ slope))
 
 
-def _measure(what: str, xy_m: FloatArray, other_m: FloatArray) -> FloatArray:
-    """What a tape would say of positions [5, 2]."""
-    if what == "distance":
+def _measure(quantity: str, xy_m: FloatArray, other_m: FloatArray) -> FloatArray:
+    """The measured quantity [5] of positions [5, 2]."""
+    if quantity == "distance":
         return np.asarray(np.hypot(xy_m[:, 0], xy_m[:, 1]))
-    if what == "spacing":
+    if quantity == "spacing":
         return np.asarray(np.hypot(xy_m[:, 0] - other_m[0], xy_m[:, 1] - other_m[1]))
-    return np.asarray(xy_m[:, 0 if what == "forward" else 1])
+    return np.asarray(xy_m[:, 0 if quantity == "forward" else 1])
 
 
-def _names(names: Sequence[str]) -> str:
-    said = [PARAMETERS[name] for name in names]
-    return said[0] if len(said) == 1 else f"{', '.join(said[:-1])} and {said[-1]}"
+def _names(keys: Sequence[str]) -> str:
+    """Names of parameters in a sentence: `height, pitch and radius`."""
+    *most, last = (PARAMETER_NAMES[key] for key in keys)
+    return f"{', '.join(most)} and {last}" if most else last
 
 
-def _said(alignment: Alignment, names: Sequence[str]) -> str:
-    return " ".join(f"{PARAMETERS[name]} {getattr(alignment, name):.2f}" for name in names)
+def _values_text(alignment: Alignment, names: Sequence[str]) -> str:
+    return " ".join(f"{PARAMETER_NAMES[name]} {getattr(alignment, name):.2f}" for name in names)

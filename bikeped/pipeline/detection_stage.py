@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from bikeped.capture.jpeg import JpegDecoder
-from bikeped.detection.base import Detector, DetectorAnswer
+from bikeped.detection.base import DetectionResult, Detector
 from bikeped.types import Frame, ImageArray
 
 #: Inferences at once on a recording, where the processor does them: see `load_detector_pool`.
@@ -38,7 +38,7 @@ class FrameDetector(Protocol):
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         """Least picture size that it needs of a frame of this size."""
 
-    def detect(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectionResult:
         """What is in the picture; raises DetectorError. Called in worker threads, as many as looks
         are allowed at once (see `Loop`)."""
 
@@ -60,7 +60,7 @@ class DetectorPool:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return self._decode_size(width, height)
 
-    def detect(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectionResult:
         detector = self._free.get()
         try:
             return detector.infer(picture.rgb, picture.frame.width, picture.frame.height)
@@ -93,6 +93,6 @@ class DetectionStage:
             rgb = self._jpeg.decode(frame.jpeg, min_width=width, min_height=height)
         return Picture(frame, rgb, received_s, acquire_ms, (time.perf_counter() - began) * 1e3)
 
-    def detect(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectionResult:
         """What the detector finds in the picture; raises DetectorError."""
         return self.detector.detect(picture)

@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from bikeped.detection.base import DetectorAnswer
+from bikeped.detection.base import DetectionResult
 from bikeped.errors import BikepedError, CaptureError, GeometryError
 from bikeped.faults import Fault
 from bikeped.feedback import assess
@@ -88,7 +88,7 @@ class _Look:
     picture: Picture
     worker: WorkerThread
     began_s: float
-    answer: asyncio.Future[DetectorAnswer]
+    answer: asyncio.Future[DetectionResult]
 
 
 @dataclass
@@ -296,7 +296,7 @@ class Loop:
             return error
         return None
 
-    def _answer(self, look: _Look) -> DetectorAnswer | None:
+    def _answer(self, look: _Look) -> DetectionResult | None:
         """What the detector says of a picture; None when a live one could not be looked at."""
         self._usual_look_s += _WEIGHT * (time.perf_counter() - look.began_s - self._usual_look_s)
         try:
@@ -318,7 +318,7 @@ class Loop:
         self._detector_fault = None
         return answer
 
-    async def _finish(self, picture: Picture, answer: DetectorAnswer) -> None:
+    async def _finish(self, picture: Picture, answer: DetectionResult) -> None:
         """Judges one answered frame, tells the light, and hands the result on."""
         frame = picture.frame
         if self._judged_s is not None and not frame.captured_s > self._judged_s:

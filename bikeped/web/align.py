@@ -21,7 +21,7 @@ from msgspec import Meta
 from bikeped.config import CameraConfig, LoadedConfig, framing, ground_camera, load_config
 from bikeped.errors import GeometryError
 from bikeped.geometry import GroundCamera
-from bikeped.geometry.alignment import PARAMETERS
+from bikeped.geometry.alignment import PARAMETER_NAMES
 from bikeped.types import Frame
 from bikeped.web.align_grid import ground_grid
 from bikeped.web.align_points import (
@@ -151,7 +151,7 @@ class Aligner:
             "start": filed if self._live else running,
             "running": running,
             "filed": filed,
-            "fields": [_field(key, in_file, running[key], filed[key]) for key in PARAMETERS],
+            "fields": [_field(key, in_file, running[key], filed[key]) for key in PARAMETER_NAMES],
         }
 
     def _grid(self, asked: GridRequest) -> dict[str, Any]:
@@ -243,4 +243,4 @@ def _range(key: str) -> tuple[float, float]:
     return float(low), float(choice["maximum"])
 
 
-_RANGES = {key: _range(key) for key in PARAMETERS}
+_RANGES = {key: _range(key) for key in PARAMETER_NAMES}

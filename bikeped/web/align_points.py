@@ -18,16 +18,16 @@ from bikeped.config import CameraConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.geometry import Framing, GroundCamera
 from bikeped.geometry.alignment import (
-    PARAMETERS,
-    Accuracy,
+    PARAMETER_NAMES,
     Alignment,
-    Fit,
+    AlignmentFit,
     Mark,
+    MeasurementAccuracy,
     Spacing,
-    reading_m,
-    ten_metre_pixel,
+    ground_distance_m,
+    pixel_at_distance,
 )
-from bikeped.geometry.alignment_fit import fit
+from bikeped.geometry.alignment_fit import fit_alignment
 
 _Pixel = Annotated[float, Meta(ge=-1e5, le=1e5)]
 _Metres = Annotated[float, Meta(ge=-1000, le=1000)]
@@ -125,7 +125,9 @@ def with_values(camera: GroundCamera, values: Values | None) -> GroundCamera:
     return Alignment(**given).camera(camera)
 
 
-def fit_points(camera: GroundCamera, framing: Framing, points: Points) -> tuple[Fit, Framing]:
+def fit_points(
+    camera: GroundCamera, framing: Framing, points: Points
+) -> tuple[AlignmentFit, Framing]:
     """Fits the points; `framing` is the camera's, whose frames they may be scaled copies of."""
     frame = framing.for_frame(points.frame.width, points.frame.height)
     names = [point.name for point in points.marks]
@@ -144,29 +146,29 @@ def fit_points(camera: GroundCamera, framing: Framing, points: Points) -> tuple[
         Spacing(names.index(pair.first), names.index(pair.second), pair.distance_m)
         for pair in points.between
     ]
-    accuracy = Accuracy(points.tape_m, points.mark_px * frame.scale)
+    accuracy = MeasurementAccuracy(points.tape_m, points.mark_px * frame.scale)
     start = with_values(camera, points.values)
-    return fit(start, marks, spacings, points.free, accuracy), frame
+    return fit_alignment(start, marks, spacings, points.free, accuracy), frame
 
 
-def fit_json(found: Fit) -> dict[str, Any]:
+def fit_json(found: AlignmentFit) -> dict[str, Any]:
     """A fit for a page, a file or a program: metres, degrees and crop pixels, one sigma."""
     return {
         "values": asdict(found.alignment),
-        "error": found.error,
-        "spare_measurements": found.spare,
-        "at_10m_error_m": found.at_10m_error_m,
-        "suspect": found.suspect,
-        "agrees": not found.strange,
+        "error": found.standard_errors,
+        "spare_measurements": found.redundancy,
+        "at_10m_error_m": found.standard_error_at_10m_m,
+        "suspect": found.suspect_mark,
+        "agrees": not found.outliers,
         "residuals": [
             {
                 "mark": r.mark,
-                "what": r.what,
+                "what": r.quantity,
                 "measured_m": r.measured_m,
                 "read_m": r.read_m,
-                "off_m": r.off_m,
-                "expected_m": r.expected_m,
-                "strange": r.strange,
+                "off_m": r.error_m,
+                "expected_m": r.standard_error_m,
+                "strange": r.is_outlier,
             }
             for r in found.residuals
         ],
@@ -209,22 +211,22 @@ def at_ten_metres(now: GroundCamera, before: GroundCamera, frame: Framing) -> di
 
     `steps`: how far the reading moves, metres, when one number grows by its step (`STEPS`).
     """
-    pixel = ten_metre_pixel(before)
-    here = ten_metre_pixel(now)
+    pixel = pixel_at_distance(before)
+    here = pixel_at_distance(now)
     if pixel is None:
         return None
     steps: dict[str, float | None] = {}
     alignment = asdict(Alignment.of(now))
-    for name in PARAMETERS:
+    for name in PARAMETER_NAMES:
         steps[name] = None
         if here is not None:
             moved = Alignment(**{**alignment, name: alignment[name] + STEPS[name]})
-            reads = reading_m(moved.camera(now), here)
+            reads = ground_distance_m(moved.camera(now), here)
             steps[name] = None if reads is None else reads - 10.0
     return {
         "pixel": np.round(frame.crop_to_frame(pixel), 1).tolist(),
         "was_m": 10.0,
-        "reads_m": reading_m(now, pixel),
+        "reads_m": ground_distance_m(now, pixel),
         "by": STEPS,
         "steps": steps,
     }

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.config import LoadedConfig, load_config
-from bikeped.detection.base import DetectorAnswer
+from bikeped.detection.base import DetectionResult
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import read_sidecar, sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import parse_scenario
@@ -52,7 +52,7 @@ class _ClipDetector:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return min(width, 640), min(height, 640)
 
-    def detect(self, picture: Any) -> DetectorAnswer:
+    def detect(self, picture: Any) -> DetectionResult:
         number = picture.frame.number
         self.done.wait(1.2 if number > LATE else 0.05)
         shown = [item for item in self._frames[number] if item.visible > 0.3]
@@ -61,7 +61,7 @@ class _ClipDetector:
             np.full(len(shown), 0.9, np.float32),
             np.asarray([item.box_px for item in shown], np.float32).reshape(-1, 4),
         )
-        return DetectorAnswer(found, 0.0, 0.0, 0.0)
+        return DetectionResult(found, 0.0, 0.0, 0.0)
 
 
 class _Showing:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.classes import COCO_NAMES, class_names, kind_table
-from bikeped.detection.model_hash import checked_sha256, sha256_of
+from bikeped.detection.model_hash import sha256_of, verify_sha256
 from bikeped.detection.model_metadata import ModelMetadata, parse_metadata, resolve_input
 from bikeped.errors import DetectorError
 from bikeped.types import Kind
@@ -149,9 +149,9 @@ def test_the_hash_is_checked(tmp_path):
     path.write_bytes(b"abc")
     known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-2
     assert sha256_of(path) == known
-    assert checked_sha256(path, known.upper()) == known
+    assert verify_sha256(path, known.upper()) == known
     with pytest.raises(DetectorError) as caught:
-        checked_sha256(path, "0" * 64)
+        verify_sha256(path, "0" * 64)
     for part in (str(path), known, "0" * 64, "detection.sha256"):
         assert part in str(caught.value)
     with pytest.raises(DetectorError, match="no such model file"):

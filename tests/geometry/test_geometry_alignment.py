@@ -16,11 +16,11 @@ from bikeped.geometry.alignment import (
     Alignment,
     Mark,
     Spacing,
+    ground_distance_m,
+    pixel_at_distance,
     plain_radius_px,
-    reading_m,
-    ten_metre_pixel,
 )
-from bikeped.geometry.alignment_fit import fit
+from bikeped.geometry.alignment_fit import fit_alignment
 
 CAMERA = GroundCamera(Lens.from_circle("equidistant", 1750, 197.9), 1752.69, 1804.54, 3.6576)
 FOUR = ((4.0, -1.5), (6.0, 2.0), (10.0, -3.0), (15.0, 4.0))
@@ -50,7 +50,7 @@ def seen(camera: GroundCamera, at, measured=("distance", "right"), noise=None) -
 def test_four_marks_give_height_and_pitch_back_from_any_start(height, pitch, model) -> None:
     start = replace(CAMERA, lens=Lens.from_circle(model, 1750, 197.9))
     truth = replace(start, height_m=height, pitch_deg=pitch)
-    found = fit(start, seen(truth, FOUR)).alignment
+    found = fit_alignment(start, seen(truth, FOUR)).alignment
     assert found.height_m == pytest.approx(height, abs=1e-5)
     assert found.pitch_deg == pytest.approx(pitch, abs=1e-4)
     assert (found.radius_px, found.cx, found.cy) == (
@@ -62,10 +62,10 @@ def test_four_marks_give_height_and_pitch_back_from_any_start(height, pitch, mod
 
 def test_forward_and_right_or_distances_and_a_spacing_do_as_well() -> None:
     truth = replace(CAMERA, height_m=4.4, pitch_deg=-11)
-    by_axes = fit(CAMERA, seen(truth, FOUR, ("forward", "right"))).alignment
+    by_axes = fit_alignment(CAMERA, seen(truth, FOUR, ("forward", "right"))).alignment
     marks = seen(truth, FOUR[:3], ("distance",))
     apart = math.dist(FOUR[0], FOUR[2])
-    by_tape = fit(CAMERA, marks, [Spacing(0, 2, apart)]).alignment
+    by_tape = fit_alignment(CAMERA, marks, [Spacing(0, 2, apart)]).alignment
     for found in (by_axes, by_tape):
         assert found.height_m == pytest.approx(4.4, abs=1e-5)
         assert found.pitch_deg == pytest.approx(-11, abs=1e-4)
@@ -76,7 +76,7 @@ def test_radius_heading_and_radial_terms() -> None:
     truth = GroundCamera(lens, 1752.69, 1804.54, 3.9, -20, heading_deg=8)
     start = replace(CAMERA, lens=Lens.from_circle("equidistant", 1750, 197.9, lens.k))
     around = [(3.0, 0.5), (5.0, -4.0), (7.0, 6.0), (10.0, 0.0), (15.0, -8.0), (14.0, 9.0)]
-    answer = fit(
+    answer = fit_alignment(
         start, seen(truth, around), free=("height_m", "pitch_deg", "radius_px", "heading_deg")
     )
     found = answer.alignment
@@ -84,7 +84,7 @@ def test_radius_heading_and_radial_terms() -> None:
     assert plain_radius_px(found.camera(start).lens) == pytest.approx(1690, abs=1e-3)
     assert found.heading_deg == pytest.approx(8, abs=1e-4)
     assert found.camera(start).lens.focal_px == pytest.approx(lens.focal_px)
-    assert answer.spare == 12 - 4
+    assert answer.redundancy == 12 - 4
 
 
 def test_errors_are_as_large_as_the_answer_says() -> None:
@@ -93,12 +93,12 @@ def test_errors_are_as_large_as_the_answer_says() -> None:
     rng = np.random.default_rng(5)
     off, said, reading = [], [], []
     for _ in range(40):
-        answer = fit(CAMERA, seen(truth, FOUR, noise=rng.normal(0, 2, (4, 2))))
+        answer = fit_alignment(CAMERA, seen(truth, FOUR, noise=rng.normal(0, 2, (4, 2))))
         off.append((answer.alignment.height_m - 4.2, answer.alignment.pitch_deg + 7.3))
-        said.append((answer.error["height_m"], answer.error["pitch_deg"]))
-        pixel = ten_metre_pixel(truth)
-        read = reading_m(answer.alignment.camera(CAMERA), pixel)
-        reading.append((read - 10) / answer.at_10m_error_m)
+        said.append((answer.standard_errors["height_m"], answer.standard_errors["pitch_deg"]))
+        pixel = pixel_at_distance(truth)
+        read = ground_distance_m(answer.alignment.camera(CAMERA), pixel)
+        reading.append((read - 10) / answer.standard_error_at_10m_m)
     spread = np.sqrt(np.mean(np.square(off), axis=0))
     # The promise also holds the tape's 2 cm, which these measurements do not have.
     assert (spread < np.mean(said, axis=0)).all()
@@ -109,14 +109,14 @@ def test_errors_are_as_large_as_the_answer_says() -> None:
 def test_a_wrong_measurement_stands_out_and_widens_the_error() -> None:
     truth = replace(CAMERA, height_m=4.2, pitch_deg=-7.3)
     marks = seen(truth, (*FOUR, (8.0, 4.0), (5.0, -5.0)))
-    good = fit(CAMERA, marks)
-    assert not good.strange
-    assert good.suspect is None
+    good = fit_alignment(CAMERA, marks)
+    assert not good.outliers
+    assert good.suspect_mark is None
     marks[3] = replace(marks[3], distance_m=marks[3].distance_m + 4.0)
-    bad = fit(CAMERA, marks)
-    assert bad.strange
-    assert bad.suspect == "4"
-    assert bad.error["height_m"] > 2 * good.error["height_m"]
+    bad = fit_alignment(CAMERA, marks)
+    assert bad.outliers
+    assert bad.suspect_mark == "4"
+    assert bad.standard_errors["height_m"] > 2 * good.standard_errors["height_m"]
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_a_wrong_measurement_stands_out_and_widens_the_error() -> None:
             ("height_m", "pitch_deg"),
             "do not tell height and pitch apart",
         ),
-        (((5, 0), (12, 0)), ("distance",), ("height_m", "pitch_deg"), "two answers fit"),
+        (((5, 0), (12, 0)), ("distance",), ("height_m", "pitch_deg"), "two solutions fit"),
         (FOUR, ("distance", "right"), ("height_m", "pitch_deg", "radius_px", "cx", "cy"), "apart"),
         (FOUR, ("distance",), ("height_m", "heading_deg"), "determine the heading"),
         (FOUR, ("distance",), ("roll_deg",), "roll_deg"),
@@ -138,7 +138,7 @@ def test_a_wrong_measurement_stands_out_and_widens_the_error() -> None:
 )
 def test_what_the_marks_do_not_determine_is_said(at, measured, free, says) -> None:
     with pytest.raises(GeometryError, match=says):
-        fit(CAMERA, seen(CAMERA, at, measured), free=free)
+        fit_alignment(CAMERA, seen(CAMERA, at, measured), free=free)
 
 
 def test_marks_that_cannot_be() -> None:
@@ -146,7 +146,7 @@ def test_marks_that_cannot_be() -> None:
         Mark("a", 1, 1, right_m=2)
     with pytest.raises(GeometryError, match="more than its distance"):
         Mark("a", 1, 1, distance_m=5, right_m=-6)
-    with pytest.raises(GeometryError, match="one too many"):
+    with pytest.raises(GeometryError, match="over-determine it"):
         Mark("a", 1, 1, distance_m=5, right_m=3, forward_m=4)
     with pytest.raises(GeometryError, match="must be above 0"):
         Mark("a", 1, 1, distance_m=0)
@@ -154,17 +154,19 @@ def test_marks_that_cannot_be() -> None:
         Mark("a", 1, math.nan, distance_m=1)
     good = seen(CAMERA, FOUR)
     with pytest.raises(GeometryError, match="same pixel"):
-        fit(CAMERA, [*good, replace(good[0], name="5")])
+        fit_alignment(CAMERA, [*good, replace(good[0], name="5")])
     with pytest.raises(GeometryError, match="mark 5 lies outside the image circle"):
-        fit(CAMERA, [*good, Mark("5", 3499, 3499, distance_m=3)])
+        fit_alignment(CAMERA, [*good, Mark("5", 3499, 3499, distance_m=3)])
     # A stop sign and a lamp: as high in the picture as only a camera that looks down sees ground.
     level = replace(CAMERA, pitch_deg=0)
     with pytest.raises(GeometryError, match="on the ground"):
-        fit(level, [Mark("1", 1700, 300, 5), Mark("2", 1800, 3400, 9)], free=("height_m",))
+        fit_alignment(
+            level, [Mark("1", 1700, 300, 5), Mark("2", 1800, 3400, 9)], free=("height_m",)
+        )
     with pytest.raises(GeometryError, match="two different marks"):
-        fit(CAMERA, good, [Spacing(0, 0, 1)])
+        fit_alignment(CAMERA, good, [Spacing(0, 0, 1)])
     with pytest.raises(GeometryError, match="spacing 1-2: 0 must be above 0"):
-        fit(CAMERA, good, [Spacing(0, 1, 0)])
+        fit_alignment(CAMERA, good, [Spacing(0, 1, 0)])
 
 
 @given(
@@ -182,16 +184,16 @@ def test_numbers_of_a_camera_there_and_back(height, pitch, radius, cx) -> None:
 
 def test_the_ten_metre_pixel_reads_ten_metres_where_it_is_seen() -> None:
     for camera in (CAMERA, replace(CAMERA, pitch_deg=-30, heading_deg=40)):
-        pixel = ten_metre_pixel(camera)
+        pixel = pixel_at_distance(camera)
         assert pixel is not None
-        assert reading_m(camera, pixel) == pytest.approx(10)
+        assert ground_distance_m(camera, pixel) == pytest.approx(10)
     # 1 % more height is 1 % more distance: what the installer's table says.
-    pixel = ten_metre_pixel(CAMERA)
+    pixel = pixel_at_distance(CAMERA)
     taller = replace(CAMERA, height_m=CAMERA.height_m * 1.01)
-    assert reading_m(taller, pixel) == pytest.approx(10.1)
-    assert reading_m(CAMERA, (CAMERA.cx, CAMERA.cy - 100)) is None
+    assert ground_distance_m(taller, pixel) == pytest.approx(10.1)
+    assert ground_distance_m(CAMERA, (CAMERA.cx, CAMERA.cy - 100)) is None
     up = replace(CAMERA, lens=Lens.from_circle("equidistant", 1750, 20), pitch_deg=60)
-    assert ten_metre_pixel(up) is None
+    assert pixel_at_distance(up) is None
 
 
 def test_no_camera_has_these_numbers() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bikeped.config import LoadedConfig, parse_config
-from bikeped.detection.base import DetectorAnswer
+from bikeped.detection.base import DetectionResult
 from bikeped.faults import fault_texts
 from bikeped.feedback import SignalLogic
 from bikeped.pipeline.detection_stage import DetectionStage, Picture
@@ -113,13 +113,13 @@ class FakeDetector:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return width, height
 
-    def detect(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectionResult:
         self.calls += 1
         self.entered.set()
         self.go.wait(PATIENCE_S)
         if self.error is not None:
             raise self.error
-        return DetectorAnswer(self.answer, 0.1, 1.0, 0.1)
+        return DetectionResult(self.answer, 0.1, 1.0, 0.1)
 
 
 class FakeLight:

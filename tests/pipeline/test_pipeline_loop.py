@@ -10,7 +10,7 @@ import pytest
 from pipeline_fakes import PATIENCE_S, FakeDetector, Rig, seen, small
 
 import bikeped.pipeline.loop as loop_module
-from bikeped.detection.base import DetectorAnswer
+from bikeped.detection.base import DetectionResult
 from bikeped.errors import CaptureError, DetectorError, GeometryError
 from bikeped.pipeline.detection_stage import Picture
 from bikeped.pipeline.latest_frame_slot import LatestFrameSlot
@@ -283,7 +283,7 @@ class PatientDetector(FakeDetector):
         self.put = 0
         self.changed = threading.Condition()
 
-    def detect(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectionResult:
         answer = super().detect(picture)
         with self.changed:
             assert self.changed.wait_for(lambda: self.put >= picture.frame.number + 2, PATIENCE_S)
@@ -328,7 +328,7 @@ class PairedDetector(FakeDetector):
         self.both = threading.Barrier(2, timeout=PATIENCE_S)
         self.later = threading.Event()
 
-    def detect(self, picture: Picture) -> DetectorAnswer:
+    def detect(self, picture: Picture) -> DetectionResult:
         self.both.wait()
         if picture.frame.number % 2:
             self.later.set()
@@ -337,7 +337,7 @@ class PairedDetector(FakeDetector):
             self.later.clear()
         if self.error is not None and picture.frame.number == 5:
             raise self.error
-        return DetectorAnswer(self.answer, 0.1, 1.0, 0.1)
+        return DetectionResult(self.answer, 0.1, 1.0, 0.1)
 
 
 @pytest.mark.parametrize("count", [8, 10])

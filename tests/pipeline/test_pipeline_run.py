@@ -173,7 +173,7 @@ def test_what_only_a_person_can_mend_ends_with_2_and_one_line(start, small_confi
 HANGS = """
 import sys, threading
 from bikeped.cli.main import main
-from bikeped.detection.base import DetectorAnswer
+from bikeped.detection.base import DetectionResult
 from bikeped.types import Detections
 import bikeped.pipeline.run as run
 
@@ -185,7 +185,7 @@ class FrameDetector:
         self.calls += 1
         if self.calls > 20:
             threading.Event().wait()  # for ever, as a driver may
-        return DetectorAnswer(Detections.empty(), 0.0, 0.0, 0.0)
+        return DetectionResult(Detections.empty(), 0.0, 0.0, 0.0)
 
 run.load_detector_pool = lambda loaded: FrameDetector()
 sys.exit(main(sys.argv[1:]))

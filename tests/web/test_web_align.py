@@ -213,7 +213,7 @@ async def test_questions_that_cannot_be(place: Path, start) -> None:
     answer = await client.post("/align/grid", data=json.dumps(grid))
     assert answer.status == 415
     refused = await (await client.post("/align/fit", json={"frame": FRAME, "marks": []})).json()
-    assert "0 measurements cannot determine 2 numbers" in refused["refused"]
+    assert "0 measurements cannot determine 2 parameters" in refused["refused"]
 
 
 @pytest.mark.parametrize("path", ["", "/state", "/frame.jpg"])

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from bikeped.capture.jpeg import MAX_PIXELS, JpegDecoder, read_size
-from bikeped.capture.opencv import as_rgb, quiet
+from bikeped.capture.opencv import as_rgb, silence_opencv
 from bikeped.errors import CaptureError, DataSetError
 from bikeped.files import write_whole
 from bikeped.types import FloatArray, ImageArray
@@ -401,7 +401,7 @@ def _decode(content: bytes) -> ImageArray:
     if content[:2] == _JPEG:
         # A decoder of its own: the picture outlives the next call.
         return JpegDecoder(1).decode(content)
-    with quiet():
+    with silence_opencv():
         data = np.frombuffer(content, np.uint8)
         picture = (
             cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

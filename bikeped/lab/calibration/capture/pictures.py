@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from bikeped.capture import VideoSource, read_size
-from bikeped.capture.images import JPEG_SUFFIXES, PICTURE_SUFFIXES, picture_paths
-from bikeped.capture.opencv import quiet
+from bikeped.capture.images import IMAGE_SUFFIXES, JPEG_SUFFIXES, image_paths
+from bikeped.capture.opencv import silence_opencv
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.types import Frame, ImageArray
 
@@ -90,7 +90,7 @@ def pictures_hash(pictures: Sequence[Picture]) -> str:
 def decode_grey(content: bytes, name: str) -> ImageArray:
     """[h, w] grey levels of an encoded picture; CalibrationError when it cannot be decoded."""
     try:
-        with quiet():
+        with silence_opencv():
             data = np.frombuffer(content, np.uint8)
             flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
             picture = cv2.imdecode(data, flags) if len(data) else None
@@ -105,12 +105,12 @@ def _load(path: Path) -> list[Picture]:
     if not path.exists():
         raise CalibrationError(f"{path}: no such file or folder")
     try:
-        files = picture_paths(path)
+        files = image_paths(path)
         if path.is_dir() and not files:
             raise CalibrationError(
-                f"{path}: holds no pictures ({', '.join(sorted(PICTURE_SUFFIXES))})"
+                f"{path}: holds no pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
             )
-        if path.is_file() and path.suffix.lower() not in PICTURE_SUFFIXES:
+        if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
             return _video(path)
         return [_picture(file) for file in files]
     except OSError as error:

@@ -11,7 +11,7 @@ import threading
 import pytest
 
 from bikeped.capture import FrameGrabber, FrameSource, PacedSource, VideoSource
-from bikeped.capture.latest import backoff_s
+from bikeped.capture.frame_grabber import backoff_s
 from bikeped.errors import CaptureError
 from bikeped.types import Frame
 
@@ -275,7 +275,7 @@ def test_the_pause_is_short_again_only_after_a_healthy_while(bench, monkeypatch)
         pauses.append(failures)
         return 0.0
 
-    monkeypatch.setattr("bikeped.capture.latest.backoff_s", note)
+    monkeypatch.setattr("bikeped.capture.frame_grabber.backoff_s", note)
     b = bench(healthy_after_s=1.0)
     b.grabber.start()
     for healthy in (False, False, True, False):
