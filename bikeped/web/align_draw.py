@@ -6,7 +6,7 @@ import numpy as np
 
 from bikeped.overlay.drawing import INK, Rgb, draw_text, fill_rect, polyline, text_size
 from bikeped.types import ImageArray
-from bikeped.web.align_grid import Grid
+from bikeped.web.align_grid import GroundGrid
 
 #: Colour and width (in sixteen-hundredths of the picture's width) of each kind of line, in order.
 _STYLE: dict[str, tuple[Rgb, float]] = {
@@ -22,7 +22,7 @@ _MARK: Rgb = (255, 80, 60)
 
 
 def draw_grid(
-    rgb: ImageArray, grid: Grid, marks: tuple[tuple[str, float, float], ...] = ()
+    rgb: ImageArray, grid: GroundGrid, marks: tuple[tuple[str, float, float], ...] = ()
 ) -> ImageArray:
     """A copy of `rgb` [h, w, 3] with the grid and marks (name, u, v) over it."""
     image = np.ascontiguousarray(rgb).copy()

@@ -1,7 +1,6 @@
 """The ground grid in a picture: metre lines, range rings, bearings, horizon, image circle.
 
-All of it through `GroundCamera.project`, the geometry that the service decides by: what the page
-draws is what the pole believes.
+All lines are projected by `GroundCamera.project`, as the service's positions are.
 """
 
 from __future__ import annotations
@@ -17,17 +16,17 @@ from bikeped.geometry import Framing, GroundCamera
 from bikeped.types import BoolArray, FloatArray
 
 RINGS_M = (5.0, 10.0, 15.0, 20.0, 25.0)
-#: Lines every metre out to here, every five out to the largest ring: farther ones only blur.
+#: Lines every metre out to here, every five metres out to the largest ring.
 METRE_LINES_M = 10.0
 REACH_M = RINGS_M[-1]
 _BEARINGS_DEG = tuple(range(-90, 91, 15))
-_FAR_M = 1e7  #: as good as infinitely far: the horizon
+_FAR_M = 1e7  #: distance that stands for the horizon
 _LABEL_BEARINGS_DEG = (-7.0, -45.0, 38.0)  #: beside the lines, not on them
 
 
 @dataclass(frozen=True)
 class Label:
-    """A word at a frame pixel; `kind` is that of the line it belongs to."""
+    """A text at a frame pixel; `kind` is that of the line it belongs to."""
 
     u: float
     v: float
@@ -36,7 +35,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class Grid:
+class GroundGrid:
     """Polylines by kind, each as u, v, u, v, ... in frame pixels, and labels.
 
     Kinds: metre, five, ahead, ring, bearing, horizon, circle. `centre` is the optical centre,
@@ -49,10 +48,10 @@ class Grid:
     foot: tuple[float, float] | None
 
 
-def ground_grid(camera: GroundCamera, framing: Framing) -> Grid:
+def ground_grid(camera: GroundCamera, framing: Framing) -> GroundGrid:
     """The grid of `camera` in frames of `framing` (see `Framing.for_frame`).
 
-    Lines run on beyond the picture's edges as far as the lens sees: who draws them cuts them.
+    Lines are not clipped at the picture's edges: they go as far as the lens sees.
     """
     open_camera = replace(camera, window_px=None)
     kinds, points, ends = _ground_lines()
@@ -62,14 +61,16 @@ def ground_grid(camera: GroundCamera, framing: Framing) -> Grid:
     for kind, start, end in zip(kinds, ends[:-1], ends[1:], strict=True):
         lines.setdefault(kind, []).extend(_runs(frame_uv[start:end], seen[start:end]))
     lines["horizon"] = _horizon(open_camera, framing)
-    turn = np.linspace(0, 2 * math.pi, 181)
-    circle = camera.lens.max_radius_px * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    angle = np.linspace(0, 2 * math.pi, 181)
+    circle = camera.lens.max_radius_px * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rim = framing.crop_to_frame(circle + np.array([camera.cx, camera.cy]))
     lines["circle"] = _runs(rim, np.ones(len(rim), np.bool_))
     centre = framing.crop_to_frame((camera.cx, camera.cy)).tolist()
     foot, foot_seen = open_camera.project([[0.0, 0.0]])
     foot_px = framing.crop_to_frame(foot[0]).tolist() if foot_seen[0] else None
-    return Grid(lines, _labels(open_camera, framing), tuple(centre), foot_px and tuple(foot_px))
+    return GroundGrid(
+        lines, _labels(open_camera, framing), tuple(centre), foot_px and tuple(foot_px)
+    )
 
 
 @cache
@@ -102,9 +103,9 @@ def _ground_lines() -> tuple[list[str], FloatArray, list[int]]:
         add("ring", ring * np.cos(angle), ring * np.sin(angle))
     for bearing in _BEARINGS_DEG:
         if bearing:
-            way = np.linspace(2.0, REACH_M, 41)
+            along = np.linspace(2.0, REACH_M, 41)
             turn = math.radians(bearing)
-            add("bearing", way * math.cos(turn), way * math.sin(turn))
+            add("bearing", along * math.cos(turn), along * math.sin(turn))
     ends = [0, *np.cumsum([len(part) for part in parts]).tolist()]
     return kinds, np.concatenate(parts), ends
 
@@ -118,26 +119,30 @@ def _horizon(camera: GroundCamera, framing: Framing) -> list[list[float]]:
 
 
 def _labels(camera: GroundCamera, framing: Framing) -> list[Label]:
-    places: list[tuple[float, float, float, str, str]] = []
-    for bearing in _LABEL_BEARINGS_DEG:
-        c, s = math.cos(math.radians(bearing)), math.sin(math.radians(bearing))
-        places += [(r * c, r * s, 0.0, f"{r:g} m", "ring") for r in RINGS_M]
+    """Labels of rings and bearings that are in view."""
+    # bearing in degrees, range and height in metres, text, kind
+    labels = [
+        (bearing, ring, 0.0, f"{ring:g} m", "ring")
+        for bearing in _LABEL_BEARINGS_DEG
+        for ring in RINGS_M
+    ]
     for bearing in _BEARINGS_DEG:
-        c, s = math.cos(math.radians(bearing)), math.sin(math.radians(bearing))
-        side = "L" if bearing < 0 else "R"
-        text = f"{abs(bearing)}\u00b0 {side}" if bearing else "ahead"
-        places.append((_FAR_M * c, _FAR_M * s, camera.height_m, text, "horizon"))
-    uv, seen = camera.project([place[:3] for place in places])
-    frame_uv = framing.crop_to_frame(uv)
+        text = f"{abs(bearing)}\u00b0 {'L' if bearing < 0 else 'R'}" if bearing else "ahead"
+        labels.append((bearing, _FAR_M, camera.height_m, text, "horizon"))
+    angle, range_m, height_m = np.array([label[:3] for label in labels]).T
+    angle = np.radians(angle)
+    xyz = np.stack([range_m * np.cos(angle), range_m * np.sin(angle), height_m], axis=1)
+    uv, seen = camera.project(xyz)
+    frame_uv = framing.crop_to_frame(uv).round(1).tolist()
     return [
-        Label(round(u, 1), round(v, 1), text, kind)
-        for (u, v), (*_, text, kind), there in zip(frame_uv.tolist(), places, seen, strict=True)
-        if there
+        Label(u, v, text, kind)
+        for (u, v), (*_, text, kind), visible in zip(frame_uv, labels, seen, strict=True)
+        if visible
     ]
 
 
 def _runs(uv: FloatArray, seen: BoolArray) -> list[list[float]]:
-    """The parts of a line that are seen, each flat, to a tenth of a pixel."""
+    """The visible parts of a line [n, 2], each as u, v, u, v, ..., to a tenth of a pixel."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
     flat = np.round(uv, 1)
     return [

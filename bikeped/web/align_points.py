@@ -1,6 +1,6 @@
-"""Marks as the page sends them and as `points.json` holds them, and the fit of them.
+"""Marks in the form of the page and of `points.json`, and the camera fit to them.
 
-One form for both: what the page exports, `bikeped align FRAME --points` takes.
+The page exports the file that `bikeped align FRAME --points` reads.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ STEPS = {
 
 
 class FrameSize(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Of the picture that the pixels lie in."""
+    """Size in pixels of the picture that marks are set in."""
 
     width: _Side
     height: _Side
 
 
 class Values(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The camera's numbers, as in the camera section; radius and centre in crop pixels."""
+    """The camera's values, as in the camera section; radius and centre in crop pixels."""
 
     height_m: float
     pitch_deg: float
@@ -84,19 +84,23 @@ class Between(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Points(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All that a fit needs beside the configuration."""
+    """Marks, distances and options of a fit."""
 
     frame: FrameSize
     marks: Annotated[list[Point], Meta(max_length=40)]
     between: Annotated[list[Between], Meta(max_length=80)] = []
-    values: Values | None = None  #: where to start, and what is not fitted; None: as configured
+    values: Values | None = (
+        None  #: start values, and those that are not fitted; None: as configured
+    )
     free: Annotated[tuple[str, ...], Meta(max_length=6)] = ("height_m", "pitch_deg")
-    mark_px: Annotated[float, Meta(ge=0.05, le=100)] = 1.5  #: how well a mark is set, frame pixels
+    mark_px: Annotated[float, Meta(ge=0.05, le=100)] = (
+        1.5  #: standard error of a mark, frame pixels
+    )
     tape_m: Annotated[float, Meta(ge=0.001, le=10)] = 0.02
 
 
 def load_points(path: Path) -> Points:
-    """A points file; BikepedError names file, key and mend."""
+    """Reads a points file; BikepedError names file, key and remedy."""
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise BikepedError(f"{path}: larger than 1 MB; is it an export of the align page?")
@@ -108,12 +112,12 @@ def load_points(path: Path) -> Points:
 
 
 def values_of(camera: GroundCamera) -> Values:
-    """The numbers of a camera."""
+    """The values of a camera."""
     return Values(**asdict(Alignment.of(camera)))
 
 
 def with_values(camera: GroundCamera, values: Values | None) -> GroundCamera:
-    """`camera` with these numbers; GeometryError when one is out of the configuration's range."""
+    """`camera` with these values; GeometryError when one is out of the configuration's range."""
     if values is None:
         return camera
     given = msgspec.structs.asdict(values)
@@ -133,7 +137,7 @@ def fit_points(
     names = [point.name for point in points.marks]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise GeometryError(f"marks: {twice[0]} stands twice; give each its own name")
+        raise GeometryError(f"marks: {twice[0]} occurs twice; give each mark its own name")
     marks = []
     for point in points.marks:
         u, v = frame.frame_to_crop((point.u, point.v)).tolist()
@@ -152,7 +156,7 @@ def fit_points(
 
 
 def fit_json(found: AlignmentFit) -> dict[str, Any]:
-    """A fit for a page, a file or a program: metres, degrees and crop pixels, one sigma."""
+    """A fit as JSON data: metres, degrees and crop pixels; errors are one standard deviation."""
     return {
         "values": asdict(found.alignment),
         "error": found.standard_errors,
@@ -176,9 +180,8 @@ def fit_json(found: AlignmentFit) -> dict[str, Any]:
 
 
 def readings(camera: GroundCamera, frame: Framing, marks: list[Point]) -> list[dict[str, Any]]:
-    """What the camera reads at each mark, and the frame pixel where its measurement would lie.
-
-    With a distance alone that is along the bearing that the camera reads.
+    """The ground position that the camera reads at each mark, and the frame pixel of the measured
+    position. A distance alone is taken along the bearing that the camera reads.
     """
     if not marks:
         return []
@@ -207,9 +210,9 @@ def readings(camera: GroundCamera, frame: Framing, marks: list[Point]) -> list[d
 
 
 def at_ten_metres(now: GroundCamera, before: GroundCamera, frame: Framing) -> dict[str, Any] | None:
-    """What a change of the numbers does to the pixel that read 10 m `before`; None: not in view.
+    """What the pixel that read 10 m `before` reads `now`; None when 10 m is not in view.
 
-    `steps`: how far the reading moves, metres, when one number grows by its step (`STEPS`).
+    `steps`: change of the reading, metres, when one value grows by its step (`STEPS`).
     """
     pixel = pixel_at_distance(before)
     here = pixel_at_distance(now)
@@ -233,7 +236,7 @@ def at_ten_metres(now: GroundCamera, before: GroundCamera, frame: Framing) -> di
 
 
 def _measured(point: Point, x: float, y: float) -> tuple[float, float] | None:
-    """Where the tape puts a mark that the camera reads at (x, y)."""
+    """Measured position (forward, right), metres, of a mark that the camera reads at (x, y)."""
     distance, right, forward = point.distance_m, point.right_m, point.forward_m
     if forward is not None:
         return forward, y if right is None else right

@@ -1,9 +1,9 @@
-"""Who may ask, and what: host names, origins, the token, body sizes, headers.
+"""Access control of the pages: host names, origins, the token, body sizes, headers.
 
-One middleware, in this order: the Host must be one of this machine's names (DNS rebinding); another
-site's page may link here, but neither embed nor fetch nor post (Origin and Fetch Metadata); a body
-that is too large is refused unread; and where there is a token, it is asked for. A browser gives it
-once, on the login page or in a link `/?token=...`, and keeps a cookie; programs send
+One middleware checks, in this order: the Host is one of this machine's names (DNS rebinding);
+another site's page may link here, but neither embed nor fetch nor post (Origin and Fetch Metadata);
+the body is not too large; and where a token is configured, the request has it. A browser gives the
+token once, on the login page or in a link `/?token=...`, and keeps a cookie; programs send
 `Authorization: Bearer TOKEN`.
 """
 
@@ -30,9 +30,9 @@ from bikeped.telemetry.http_server import host_name
 COOKIE = "bikeped_session"
 SESSION_S = 7 * 24 * 3600
 SHORTEST_TOKEN = 12
-#: Bodies are settings and scenarios: text, never video.
+#: Bytes of a request's body: settings and scenarios, as text.
 MAX_BODY = 1024 * 1024
-#: Open to those who have not logged in: what the login page is made of.
+#: Paths that need no session: what the login page is made of.
 _OPEN = ("/login", "/session", "/static/")
 _SAFE_METHODS = frozenset({hdrs.METH_GET, hdrs.METH_HEAD, hdrs.METH_OPTIONS})
 
@@ -56,10 +56,10 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 @dataclass(frozen=True)
 class AccessPolicy:
-    """Who is let in.
+    """Which host names are served, and which token opens a session.
 
-    `names`: host names that are answered to; `any_address`: so is every plain address, which no
-    foreign name can stand for. `token` None: whoever reaches the port is let in.
+    `names`: host names of this machine; `any_address`: plain IP addresses are served too (DNS
+    rebinding needs a name). `token` None: no login, every client of the port has access.
     """
 
     names: frozenset[str]
@@ -78,12 +78,12 @@ class AccessPolicy:
         return hmac.compare_digest(_digest(given), _digest(self.token))
 
     def new_cookie(self, now_s: float) -> str:
-        """A session's cookie. It outlives a restart, and ends when the token is changed."""
+        """A session's cookie; valid across restarts, until the token is changed."""
         expires = f"{now_s + SESSION_S:.0f}"
         return f"{expires}.{self._sign(expires)}"
 
     def is_cookie(self, cookie: str, now_s: float) -> bool:
-        """Whether a cookie is one of ours and not expired."""
+        """Whether a cookie was signed with this token and has not expired."""
         expires, _, signature = cookie.partition(".")
         if self.token is None or not (expires.isascii() and expires.isdigit()):
             return False
@@ -91,7 +91,7 @@ class AccessPolicy:
         return right and len(expires) < 16 and now_s < float(expires)
 
     def has_session(self, request: web.Request) -> bool:
-        """Whether a request is let in without being asked for the token."""
+        """Whether a request needs no token: none is configured, or its cookie is valid."""
         return self.token is None or self.is_cookie(request.cookies.get(COOKIE, ""), time.time())
 
     def _sign(self, text: str) -> str:
@@ -102,7 +102,7 @@ class AccessPolicy:
 def load_access_policy(
     config: WebConfig, base_dir: Path = Path(), source: str = "web"
 ) -> AccessPolicy:
-    """Who is let in by this configuration; `source` names it in errors.
+    """The access policy of this configuration; `source` names it in errors.
 
     Raises ConfigError when others could reach the pages without a token, or when the token's file
     cannot be used.
@@ -147,7 +147,7 @@ def _read_token(path: Path) -> str:
 
 
 class FailedLogins:
-    """Wrong tokens of the last minute, by address and in all; bounded."""
+    """Wrong tokens of the last `window_s` seconds, by client address and in all; bounded."""
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class FailedLogins:
             self._by_address.popitem(last=False)
 
     def wait_s(self, address: str) -> float:
-        """How long `address` must wait before its token is looked at again; 0: not at all."""
+        """Seconds until a token from `address` is checked again; 0: now."""
         mine = self._recent(self._by_address.get(address, []))
         if len(mine) >= self._per_address:
             return mine[0] + self._window_s - self._clock()
@@ -183,13 +183,13 @@ class FailedLogins:
 
 
 def guard(
-    access: AccessPolicy, login: Callable[[web.Request], web.Response], failures: FailedLogins
+    policy: AccessPolicy, login: Callable[[web.Request], web.Response], failures: FailedLogins
 ) -> Any:
-    """The middleware. `login` makes the answer to a person who has no session yet."""
+    """The middleware. `login` answers requests without a session or Bearer token."""
 
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if not access.knows_host(request.headers.get(hdrs.HOST, "")):
+        if not policy.knows_host(request.headers.get(hdrs.HOST, "")):
             raise web.HTTPForbidden(
                 text="This Host is not allowed: open the pages by this machine's address or as "
                 "http://localhost, or name the host in web.allowed_hosts."
@@ -202,11 +202,11 @@ def guard(
                 actual_size=request.content_length or 0,
                 headers={hdrs.CONNECTION: "close"},
             )
-        if request.path.startswith(_OPEN) or access.has_session(request):
+        if request.path.startswith(_OPEN) or policy.has_session(request):
             return await handler(request)
         scheme, _, given = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
         if scheme.lower() == "bearer":
-            check_token(access, failures, request, given.strip())
+            check_token(policy, failures, request, given.strip())
             return await handler(request)
         return login(request)
 
@@ -214,7 +214,7 @@ def guard(
 
 
 def check_token(
-    access: AccessPolicy, failures: FailedLogins, request: web.Request, given: str
+    policy: AccessPolicy, failures: FailedLogins, request: web.Request, given: str
 ) -> None:
     """Raises HTTPTooManyRequests or HTTPUnauthorized unless `given` is the token."""
     address = _rate_limit_key(request.remote or "")
@@ -224,7 +224,7 @@ def check_token(
             text=f"Too many wrong tokens: try again in {wait_s:.0f} s.",
             headers={hdrs.RETRY_AFTER: f"{wait_s:.0f}"},
         )
-    if not access.is_token(given):
+    if not policy.is_token(given):
         failures.count(address)
         raise web.HTTPUnauthorized(
             text="This token is not the one in web.token_file.",
@@ -233,7 +233,10 @@ def check_token(
 
 
 def _is_same_origin(request: web.Request) -> bool:
-    """Whether the request is of our own pages, a person's, or a program's; not another site's."""
+    """Whether the request comes from one of these pages, the address bar or a program.
+
+    Another site's page may link here (a navigation), not embed, fetch or post.
+    """
     headers = request.headers
     changes = request.method not in _SAFE_METHODS or hdrs.UPGRADE in headers
     origin = headers.get(hdrs.ORIGIN)
@@ -248,7 +251,6 @@ def _is_same_origin(request: web.Request) -> bool:
         return True
     if changes:
         return False
-    # A link may lead here; a picture, a script or a frame of another site may not.
     opened = headers.get("Sec-Fetch-Mode") == "navigate"
     return site == "none" or (opened and headers.get("Sec-Fetch-Dest") == "document")
 
@@ -270,7 +272,7 @@ def _is_address(name: str) -> bool:
 
 
 def _rate_limit_key(address: str) -> str:
-    """An IPv4 address, or the /64 of an IPv6 address, all of which one visitor may have."""
+    """An IPv4 address, or the /64 of an IPv6 address, which one client may have as a whole."""
     try:
         found = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

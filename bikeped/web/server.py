@@ -1,4 +1,4 @@
-"""The application around the pages: their common frame, static files, login, errors."""
+"""The web application around the pages: common frame, static files, login, errors."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ class Page:
 
 
 _PAGES: web.AppKey[list[Page]] = web.AppKey("pages", list)
-_ACCESS: web.AppKey[AccessPolicy] = web.AppKey("access", AccessPolicy)
+_POLICY: web.AppKey[AccessPolicy] = web.AppKey("policy", AccessPolicy)
+_FAILED_LOGINS: web.AppKey[FailedLogins] = web.AppKey("failed_logins", FailedLogins)
 _FILES: web.AppKey[dict[str, _File]] = web.AppKey("files", dict)
 
 
@@ -81,34 +82,28 @@ class _File:
 
 
 def make_application(
-    access: AccessPolicy, *page_adders: Callable[[web.Application], None]
+    policy: AccessPolicy, *page_adders: Callable[[web.Application], None]
 ) -> web.Application:
     """The application: each of `page_adders` adds its page and routes to it."""
     failures = FailedLogins()
-
-    def login(request: web.Request) -> web.Response:
-        return _answer_without_session(request, access, failures)
-
     app = web.Application(
-        middlewares=[guard(access, login, failures), _errors], client_max_size=MAX_BODY
+        middlewares=[guard(policy, _answer_without_session, failures), _errors],
+        client_max_size=MAX_BODY,
     )
-    app[_PAGES], app[_ACCESS], app[_FILES] = [], access, _load_static(WEB_FOLDER)
+    app[_PAGES], app[_FILES] = [], _load_static(WEB_FOLDER)
+    app[_POLICY], app[_FAILED_LOGINS] = policy, failures
     app.on_response_prepare.append(_set_security_headers)
     app.router.add_get("/static/{name:.+}", _static)
     app.router.add_get("/favicon.ico", _favicon)
     app.router.add_get("/session", _session)
     app.router.add_get("/login", _login_form)
-
-    async def log_in(request: web.Request) -> web.Response:
-        return await _log_in(request, access, failures)
-
-    app.router.add_post("/login", log_in)
+    app.router.add_post("/login", _log_in)
     app.router.add_post("/logout", _log_out)
     for add in page_adders:
         add(app)
     paths = [page.path for page in app[_PAGES]]
     if paths and "/" not in paths:
-        app.router.add_get("/", _to(paths[0]))
+        app.router.add_get("/", _redirect_to(paths[0]))
     return app
 
 
@@ -120,7 +115,7 @@ def add_page(app: web.Application, page: Page) -> None:
     app[_PAGES].sort(key=lambda p: _ORDER.index(p.path) if p.path in _ORDER else len(_ORDER))
 
     async def show(request: web.Request) -> web.Response:
-        if "token" in request.query:  # has done its work, and must not stay in sight
+        if "token" in request.query:  # used already; it must not stay in the address bar
             raise web.HTTPFound(page.path)
         return _page(request, page)
 
@@ -128,7 +123,7 @@ def add_page(app: web.Application, page: Page) -> None:
 
 
 async def json_body(request: web.Request, kind: type[T]) -> T:
-    """The request's JSON as `kind` (a msgspec type); BikepedError, which the caller reads, else."""
+    """The request's JSON as `kind` (a msgspec type); BikepedError when it is not one."""
     if request.content_type != "application/json":
         raise web.HTTPUnsupportedMediaType(text="Send JSON: Content-Type: application/json.")
     try:
@@ -142,7 +137,7 @@ async def json_body(request: web.Request, kind: type[T]) -> T:
 
 
 def json_answer(data: Any, status: int = 200) -> web.Response:
-    """`data` (anything msgspec encodes) as JSON that nobody keeps."""
+    """`data` (anything msgspec encodes) as JSON that browsers do not cache."""
     return web.Response(
         status=status,
         body=msgspec.json.encode(data),
@@ -196,7 +191,7 @@ async def _favicon(request: web.Request) -> web.StreamResponse:
 
 
 def _answer_file(request: web.Request, file: _File) -> web.StreamResponse:
-    # Asked for anew each time: after an update the pages must not run on yesterday's scripts.
+    # Browsers revalidate each time: after an update a page must not run on the old scripts.
     headers = {hdrs.ETAG: f'"{file.etag}"', hdrs.CACHE_CONTROL: "no-cache"}
     if any(tag.value == file.etag for tag in request.if_none_match or ()):
         return web.Response(status=304, headers=headers)
@@ -223,7 +218,7 @@ def _page(request: web.Request, page: Page, status: int = 200) -> web.Response:
     return web.Response(status=status, text=text, content_type="text/html")
 
 
-def _to(path: str) -> Handler:
+def _redirect_to(path: str) -> Handler:
     async def redirect(_request: web.Request) -> web.StreamResponse:
         raise web.HTTPFound(path)
 
@@ -237,50 +232,43 @@ _REFUSED = Page("/login", "Log in", "Log in: not the token", "login-refused.html
 _WAIT = Page("/login", "Log in", "Log in: please wait", "login-wait.html")
 
 
-def _answer_without_session(
-    request: web.Request, access: AccessPolicy, failures: FailedLogins
-) -> web.Response:
-    """The answer to somebody without a session: a link's token is taken, others are asked."""
-    wants_page = request.method == hdrs.METH_GET and "text/html" in request.headers.get(
-        "Accept", ""
-    )
-    if not wants_page:
+def _answer_without_session(request: web.Request) -> web.Response:
+    """Takes the token of a link, or shows the login page; HTTPUnauthorized for programs."""
+    accept = request.headers.get(hdrs.ACCEPT, "")
+    if request.method != hdrs.METH_GET or "text/html" not in accept:
         raise web.HTTPUnauthorized(
             text="A token is needed: log in, or send Authorization: Bearer TOKEN.",
             headers={hdrs.WWW_AUTHENTICATE: "Bearer"},
         )
     if "token" not in request.query:
         return _page(request, _LOGIN, 401)
-    refused = _login_refusal(request, access, failures, request.query["token"])
-    return refused or _start_session(request, access, request.path)
+    return _try_login(request, request.query["token"], request.path)
 
 
-def _login_refusal(
-    request: web.Request, access: AccessPolicy, failures: FailedLogins, given: str
-) -> web.Response | None:
-    """The page that says why `given` does not let a person in; None when it does."""
+def _try_login(request: web.Request, token: str, path: str) -> web.Response:
+    """Starts a session that leads to `path`, or shows the page that says why not."""
     try:
-        check_token(access, failures, request, given)
+        check_token(request.app[_POLICY], request.app[_FAILED_LOGINS], request, token)
     except web.HTTPTooManyRequests as error:
         answer = _page(request, _WAIT, error.status)
         answer.headers[hdrs.RETRY_AFTER] = error.headers[hdrs.RETRY_AFTER]
         return answer
     except web.HTTPUnauthorized as error:
         return _page(request, _REFUSED, error.status)
-    return None
+    return _start_session(request, path)
 
 
-def _start_session(request: web.Request, access: AccessPolicy, path: str) -> web.Response:
-    """Sets the cookie and leads on to `path`.
+def _start_session(request: web.Request, path: str) -> web.Response:
+    """Sets the session cookie and leads on to `path`.
 
-    Not by a redirect: a browser that came here from another site (a link in a mail) does not send a
-    SameSite=Strict cookie along a chain that began there. A page of our own starts a new one.
+    By a page, not a redirect: a browser that follows a link on another site (in a mail) does not
+    send a SameSite=Strict cookie along the redirects that began there.
     """
     text = render("welcome.html", WEB_FOLDER / "templates", target=_local(path))
     answer = web.Response(text=text, content_type="text/html")
     answer.set_cookie(
         COOKIE,
-        access.new_cookie(time.time()),
+        request.app[_POLICY].new_cookie(time.time()),
         max_age=SESSION_S,
         httponly=True,
         samesite="Strict",
@@ -294,16 +282,12 @@ async def _login_form(request: web.Request) -> web.Response:
     return _page(request, _LOGIN)
 
 
-async def _log_in(
-    request: web.Request, access: AccessPolicy, failures: FailedLogins
-) -> web.Response:
+async def _log_in(request: web.Request) -> web.Response:
     try:
         form = await asyncio.wait_for(request.post(), _BODY_S)
     except asyncio.TimeoutError as error:
         raise web.HTTPRequestTimeout(text="The form did not arrive.") from error
-    token, path = form.get("token"), form.get("next")
-    refused = _login_refusal(request, access, failures, token if isinstance(token, str) else "")
-    return refused or _start_session(request, access, path if isinstance(path, str) else "/")
+    return _try_login(request, str(form.get("token", "")), str(form.get("next", "/")))
 
 
 async def _log_out(_request: web.Request) -> web.StreamResponse:
@@ -313,11 +297,11 @@ async def _log_out(_request: web.Request) -> web.StreamResponse:
 
 
 async def _session(request: web.Request) -> web.StreamResponse:
-    """Whether the visitor is let in already."""
-    return json_answer({"let_in": request.app[_ACCESS].has_session(request)})
+    """Whether the visitor has a session already."""
+    return json_answer({"let_in": request.app[_POLICY].has_session(request)})
 
 
 def _local(path: str) -> str:
-    """`path` if it leads to this server, else the first page."""
+    """`path` if it is one of this server, else the first page."""
     fine = re.fullmatch(r"/(?![/\\])[\w\-./]*", path, re.ASCII)
     return path if fine and ".." not in path else "/"

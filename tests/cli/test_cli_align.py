@@ -142,7 +142,7 @@ def test_marks_that_do_not_tell_end_with_2(site, capsys) -> None:
     clip, config, points, data = site
     for change, says in (
         ({"marks": data["marks"][:1], "free": ["height_m", "pitch_deg", "cx"]}, "add 1 more"),
-        ({"marks": [data["marks"][0]] * 2}, "1 stands twice"),
+        ({"marks": [data["marks"][0]] * 2}, "1 occurs twice"),
         ({"between": [{"first": "1", "second": "9", "distance_m": 2}]}, "no mark 9"),
         (
             {

@@ -132,9 +132,9 @@ async def test_state_says_where_numbers_come_from(
     state = await (await client.get("/align/state")).json()
     origin = {field["key"]: field["origin"] for field in state["fields"]}
     assert origin["radius_px"] == (
-        "camera.radius_px, which goes before the focal length in camera_calibration.json"
+        "camera.radius_px, which overrides the focal length in camera_calibration.json"
     )
-    assert "saving writes camera.cx, which then goes before it" in origin["cx"]
+    assert "saving writes camera.cx, which then overrides it" in origin["cx"]
     assert (state["running"]["height_m"], state["filed"]["height_m"]) == (5, 3.6576)
     assert state["start"]["height_m"] == 3.6576  # the service's file, not what it was started with
     client = await start(Site(place, "camera.height_m=5", live=False))

@@ -156,7 +156,7 @@ def test_sliders_and_steps_move_the_grid_and_what_reads_10_m(align) -> None:
     expect(page.locator("#dial-height_m-note")).to_contain_text(
         "+0.1 m moves a 10 m mark by +27 cm"
     )
-    expect(page.locator("#dial-radius_px-note")).to_contain_text("goes before the focal length in")
+    expect(page.locator("#dial-radius_px-note")).to_contain_text("overrides the focal length in")
     height = page.locator("#dial-height_m")
     height.fill("4.0234")  # 10 % more
     expect(page.locator("#ten-figure")).to_have_text("11.00 m")
