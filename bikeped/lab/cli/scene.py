@@ -231,7 +231,7 @@ def _mark(image: ImageArray, objects: list[DrawnObject]) -> None:
 def _dataset(
     loaded: LoadedConfig, out: Path, count: int, seed: int, size: tuple[int, int], lens: str
 ) -> dict[str, Any]:
-    from bikeped.lab.rendering import write_dataset
+    from bikeped.lab.rendering.dataset import write_dataset
 
     camera = _camera(loaded, size) if lens == "configured" else None
     with progress_bar("drawing", count) as tell:

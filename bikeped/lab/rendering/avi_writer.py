@@ -13,7 +13,7 @@ from types import TracebackType
 from bikeped.errors import CaptureError
 from bikeped.files import WholeFile
 
-#: AVI's 32-bit sizes end at 4 GB, and careless readers at 2.
+#: AVI's 32-bit sizes end at 4 GB; some readers fail beyond 2.
 _MAX_BYTES = 2_000_000_000
 _KEYFRAME = 0x10
 _HAS_INDEX = 0x10
@@ -68,21 +68,9 @@ class AviWriter:
         width, height = self.size
         frames = len(self._index)
         main = struct.pack(
-            "<14I",
-            round(1e6 / self.fps),
-            self._largest * self.fps,
-            0,
-            _HAS_INDEX,
-            frames,
-            0,
-            1,
-            self._largest,
-            width,
-            height,
-            0,
-            0,
-            0,
-            0,
+            "<10I16x",
+            *(round(1e6 / self.fps), self._largest * self.fps, 0, _HAS_INDEX, frames, 0, 1),
+            *(self._largest, width, height),
         )
         stream = b"vidsMJPG" + struct.pack(
             "<IHHIIIIIIII4H",
@@ -96,14 +84,8 @@ class AviWriter:
         head = b"AVI " + _chunk(b"LIST", hdrl)
         movi_start = 8 + len(head) + 8
         movi_size = max(movi_end - movi_start, 4)
-        return (
-            b"RIFF"
-            + struct.pack("<I", total - 8)
-            + head
-            + b"LIST"
-            + struct.pack("<I", movi_size)
-            + b"movi"
-        )
+        riff = b"RIFF" + struct.pack("<I", total - 8) + head
+        return riff + b"LIST" + struct.pack("<I", movi_size) + b"movi"
 
     def __enter__(self) -> AviWriter:
         return self

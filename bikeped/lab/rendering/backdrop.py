@@ -1,4 +1,4 @@
-"""What stays in a scene: sky, ground and houses, drawn once for a camera and its conditions."""
+"""The static part of a scene: sky, ground and houses, drawn once per camera and conditions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SAMPLES = (-0.375, -0.125, 0.125, 0.375)
 
 @dataclass(frozen=True)
 class FixtureSprite:
-    """A fixture in the picture, its mesh and how it looks."""
+    """A fixture in the picture."""
 
     item: Fixture
     mesh: Mesh
@@ -34,8 +34,8 @@ class FixtureSprite:
 
 @dataclass(frozen=True)
 class Backdrop:
-    """`image` [h, w, 3]: everything that stays but the fixtures, which stand beside it so that
-    they can hide who walks behind them. `lit` [h, w]: inside the image circle."""
+    """`image` [h, w, 3]: sky, ground and houses; the fixtures (`standing`) are sprites, which can
+    hide agents. `lit` [h, w]: inside the image circle."""
 
     view: SceneCamera
     conditions: Conditions
@@ -53,20 +53,16 @@ class Backdrop:
 
 @lru_cache(maxsize=2)
 def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
-    """The backdrop; the last two are kept, for scenarios that share one."""
-    light, layout, ray = (
-        lighting(conditions),
-        street_layout(conditions.place, conditions.clutter),
-        rays(view),
-    )
+    """The backdrop; the last two are cached, for scenarios that share one."""
+    light, ray = lighting(conditions), rays(view)
+    layout = street_layout(conditions.place, conditions.clutter)
     canvas = _sky(ray, light, conditions)
     _ground(canvas, ray, view, layout, light)
     image = np.clip(canvas, 0, 255).astype(np.uint8)
     for item in sorted(layout.houses, key=lambda h: -abs(h.front) - abs((h.x0 + h.x1) / 2 - 5)):
         _draw_far(image, house(item, light.lamps), view, light)
-    image = np.asarray(
-        cv2.multiply(image, cv2.merge([ray.vignette] * 3), dtype=cv2.CV_8U), np.uint8
-    )
+    darkened = cv2.multiply(image, cv2.merge([ray.vignette] * 3), dtype=cv2.CV_8U)
+    image = np.asarray(darkened, np.uint8)
     image[~ray.lit] = 0
     standing = []
     for thing in layout.fixtures:
@@ -82,28 +78,18 @@ def backdrop(view: SceneCamera, conditions: Conditions) -> Backdrop:
 def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
     """Sky colours [h, w, 3]: paler and hazier toward the horizon, with a flat layer of clouds."""
     width, height = ray.lit.shape[1], ray.lit.shape[0]
-    world = np.asarray(
-        cv2.resize(ray.world, (width // 2, height // 2), interpolation=cv2.INTER_LINEAR), np.float32
-    )  # the sky is smooth
+    half = (width // 2, height // 2)  # the sky is smooth
+    world = np.asarray(cv2.resize(ray.world, half, interpolation=cv2.INTER_LINEAR), np.float32)
     up = np.clip(world[..., 2], 0, 1)
     part = ((1 - up) ** 3)[..., None]
     out = light.sky_top.astype(np.float32) * (1 - part) + light.sky_low.astype(np.float32) * part
     spread = 1 / (up + 0.12)
-    tile = noise_tile(conditions.place % 3)
     shift = float(conditions.seed % 97)
-    cloud = np.asarray(
-        cv2.remap(
-            tile,
-            (world[..., 0] * spread * 60 + shift) % 512,
-            (world[..., 1] * spread * 60) % 512,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_WRAP,
-        )
-    )
+    across, down = world[..., 0] * spread * 60 + shift, world[..., 1] * spread * 60
+    cloud = _noise(conditions.place % 3, across, down)
     cover = np.clip(cloud * 0.35 + light.clouds - 0.45, 0, 0.8) * np.clip(up * 6, 0, 1)
-    white = np.clip(
-        light.sky_low * 0.35 + 165 * light.ground / max(light.ground.max(), 0.9), 0, 250
-    )
+    white = light.sky_low * 0.35 + 165 * light.ground / max(light.ground.max(), 0.9)
+    white = np.clip(white, 0, 250)
     out += cover[..., None] * (white.astype(np.float32) - out)
     if light.sun.any():
         toward = np.clip(world @ light.to_sun.astype(np.float32), 0, 1)
@@ -112,6 +98,13 @@ def _sky(ray: Rays, light: Lighting, conditions: Conditions) -> Float32Array:
         warm = np.array([1.0, 0.95, 0.8], np.float32)
         out[near] += (glow * (140 + 160 * light.glare))[:, None] * warm
     return np.asarray(cv2.resize(out, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _noise(seed: int, x: FloatArray | Float32Array, y: FloatArray | Float32Array) -> Float32Array:
+    """The repeating noise tile read at columns `x` and rows `y`, of equal shape."""
+    tile, wrap = noise_tile(seed), cv2.BORDER_WRAP
+    read = cv2.remap(tile, x % 512, y % 512, cv2.INTER_LINEAR, borderMode=wrap)
+    return np.asarray(read, np.float32)
 
 
 def _ground(
@@ -136,7 +129,6 @@ def _ground(
     fine = float(np.clip(2.2 / view.focal_px * 4.0, 0.012, 0.05))
     near = ground_map(layout, eye[0] - 16, eye[1] - 3, eye[0] + 16, eye[1] + 17, fine)
     far = ground_map(layout, eye[0] - 56, eye[1] - 28, eye[0] + 56, eye[1] + 50, 0.08)
-    out = np.empty((*x.shape, 3), np.float32)
     blurred = GroundMap(np.asarray(cv2.blur(far.image, (9, 9)), np.uint8), far.x0, far.y0, far.res)
     at_far = _sample_map(far, x, y, along, _SAMPLES)
     at_horizon = _sample_map(blurred, x, y, along, (0.0,))
@@ -153,13 +145,7 @@ def _ground(
     out *= lit
     if light.wet:  # a wet road mirrors the sky, the flatter the more
         shine = 0.10 + 0.75 * (1 - down) ** 5
-        tile = noise_tile(1)
-        patch = np.asarray(
-            cv2.remap(
-                tile, (x * 24) % 512, (y * 24) % 512, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-            )
-        )
-        patch = patch * np.clip(1.5 / deep, 0, 1)
+        patch = _noise(1, x * 24, y * 24) * np.clip(1.5 / deep, 0, 1)
         shine = np.clip(shine * (0.75 + 0.3 * patch), 0, 0.85)[..., None]
         out += shine * (light.sky_low.astype(np.float32) * 0.9 - out)
     haze = (1 - np.exp(-np.maximum(away - 15, 0) / light.haze_m))[..., None]
@@ -221,10 +207,8 @@ def _draw_far(image: ImageArray, mesh: Mesh, view: SceneCamera, light: Lighting)
     pixels = view.pixels(quads[facing].reshape(-1, 3)).reshape(-1, 4, 2)
     width, height = view.size
     with np.errstate(invalid="ignore"):
-        seen = np.isfinite(pixels).all(axis=(1, 2))
-        seen &= (pixels.max(axis=1) > 0).all(axis=1) & (pixels.min(axis=1) < (width, height)).all(
-            axis=1
-        )
+        seen = np.isfinite(pixels).all(axis=(1, 2)) & (pixels.max(axis=1) > 0).all(axis=1)
+        seen &= (pixels.min(axis=1) < (width, height)).all(axis=1)
     kept = facing[seen]
     away = np.linalg.norm(middle[kept] - view.eye_m, axis=1)
     haze = (1 - np.exp(-np.maximum(away - 15, 0) / light.haze_m))[:, None]

@@ -1,4 +1,4 @@
-"""A scenario as a video file, and beside it a file with exact boxes of who is in every picture."""
+"""A scenario as a video file, and beside it a sidecar file with the exact boxes of every frame."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import simplejpeg
 
@@ -23,7 +24,7 @@ FORMAT = "bikeped drawn boxes 2"
 
 @dataclass(frozen=True)
 class ClipTruth:
-    """A sidecar file as read: its header, the time of every frame and who was in it."""
+    """A sidecar file: its header, the time of every frame and the road users in it."""
 
     header: dict[str, Any]
     times_s: tuple[float, ...]
@@ -90,7 +91,7 @@ def encode_jpeg(image: ImageArray, quality: int) -> bytes:
 
 
 def read_sidecar(path: Path) -> ClipTruth:
-    """Header, times and objects of every frame; CaptureError when the file is not a sidecar."""
+    """Reads a sidecar file; CaptureError when it is none."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         header = json.loads(lines[0])
@@ -141,20 +142,4 @@ def _line(number: int, t: float, objects: Sequence[DrawnObject]) -> dict[str, An
 
 
 def _object(item: dict[str, Any]) -> DrawnObject:
-    def row(key: str, count: int) -> tuple[float, ...]:
-        values = tuple(float(v) for v in item[key])
-        if len(values) != count:
-            raise ValueError(key)
-        return values
-
-    return DrawnObject(
-        id=int(item["id"]),
-        kind=str(item["kind"]),
-        label=Kind[str(item["label"]).upper()],
-        box_px=row("box_px", 4),  # type: ignore[arg-type]
-        full_box_px=row("full_box_px", 4),  # type: ignore[arg-type]
-        visible=float(item["visible"]),
-        xy_m=row("xy_m", 2),  # type: ignore[arg-type]
-        world_m=row("world_m", 2),  # type: ignore[arg-type]
-        heading_rad=float(item["heading_rad"]),
-    )
+    return msgspec.convert({**item, "label": Kind[item["label"].upper()].value}, DrawnObject)

@@ -1,4 +1,4 @@
-"""Puts sprites, shadows and glows into a picture, in place."""
+"""Draws sprites, shadows and glows into a picture, in place."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from bikeped.lab.rendering.backdrop import Backdrop
 from bikeped.lab.rendering.mesh import Lamp
 from bikeped.lab.rendering.render_camera import SceneCamera
-from bikeped.lab.rendering.sprite import Sprite, inside
+from bikeped.lab.rendering.sprite import Sprite, overlapping_slices
 from bikeped.types import Float32Array, FloatArray, ImageArray
 
 _EVEN = 0.04  #: vignettes that differ by less within a sprite are taken as one
@@ -20,7 +20,7 @@ _RING = np.linspace(0, 2 * np.pi, 17)[:-1]
 def paste_sprite(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
     """Draws a sprite over the picture, darkened toward the lens' rim and paler in the distance."""
     height, width = sprite.alpha.shape
-    spot = inside(street.view.size, sprite.left, sprite.top, width, height)
+    spot = overlapping_slices(street.view.size, sprite.left, sprite.top, width, height)
     if spot is None:
         return
     rows, columns, patch_rows, patch_columns = spot
@@ -36,7 +36,7 @@ def paste_sprite(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
     vignette = street.vignette[rows, columns]
     gain = float(vignette[vignette.shape[0] // 2, vignette.shape[1] // 2])
     if float(vignette.max() - vignette.min()) > _EVEN:
-        # Near the rim: who is half beyond it must not be as black on this side as on that one.
+        # Near the rim a sprite is darker on the side toward it.
         lit = cv2.multiply(colour, cv2.merge([vignette] * 3), dtype=cv2.CV_8U)
         colour, gain = np.asarray(lit, np.uint8), 1.0
     part[:] = cv2.addWeighted(kept, 1.0, colour, gain, 0)
@@ -51,7 +51,7 @@ def darken(
     keep: FloatArray,
 ) -> None:
     """Multiplies the picture by `keep` [3] where `cover` [h, w] is 1."""
-    spot = inside(size, left, top, cover.shape[1], cover.shape[0])
+    spot = overlapping_slices(size, left, top, cover.shape[1], cover.shape[0])
     if spot is None:
         return
     rows, columns, patch_rows, patch_columns = spot
@@ -60,7 +60,7 @@ def darken(
     part[:] = cv2.multiply(part, gain, dtype=cv2.CV_8U)
 
 
-def footprint(
+def contact_shadow(
     view: SceneCamera, xy_m: FloatArray, size_m: tuple[float, float], heading_rad: float
 ) -> tuple[int, int, Float32Array] | None:
     """The soft patch below something of `size_m` (length, width): left, top, coverage [h, w]."""
@@ -83,7 +83,7 @@ def footprint(
     return int(low[0]), int(low[1]), soft
 
 
-def shine(
+def add_glow(
     image: ImageArray, street: Backdrop, lamps: Sequence[Lamp], xy_m: FloatArray | None
 ) -> None:
     """Halos about lamps; those of a vehicle at `xy_m` only where they look toward the camera."""
@@ -99,7 +99,9 @@ def shine(
         radius = 0.75 * lamp.strength**0.5 * street.view.focal_px / max(away, 1.5)
         glow = _halo(min(radius, 220.0))
         r = glow.shape[0] // 2
-        spot = inside(street.view.size, int(pixel[0]) - r, int(pixel[1]) - r, 2 * r + 1, 2 * r + 1)
+        spot = overlapping_slices(
+            street.view.size, int(pixel[0]) - r, int(pixel[1]) - r, 2 * r + 1, 2 * r + 1
+        )
         if spot is None:
             continue
         rows, columns, patch_rows, patch_columns = spot

@@ -1,4 +1,4 @@
-"""Light and weather of a drawn scene: from a few words to suns, skies and noise."""
+"""Light and weather of a drawn scene."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ WEATHERS = ("dry", "rain")
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a scene looks like beside who is in it.
+    """What a scene looks like apart from its road users.
 
     `seed`: clothes, paints, noise. `light`: day, overcast, dusk, night, glare. `weather`: dry,
     rain. `place`: road layout, houses, textures and occluders (poles, trees, parked cars); 0 is
     the plain street of the bundled scenarios. `noise`: standard deviation of the sensor's noise in
     grey levels by day; darkness raises it. `clutter`: this many more bollards, bins, signs and
-    hydrants near the usual camera's place than the place has.
+    hydrants near the default camera than the place has.
     """
 
     seed: int = 0
@@ -88,25 +88,20 @@ def lighting(conditions: Conditions) -> Lighting:
     clouds, haze, noise, glare = float(rng.uniform(0.1, 0.8)), 240.0, conditions.noise, 0.0
     if kind == "overcast":
         sun, ambient = np.zeros(3), np.array([0.76, 0.77, 0.8])
-        top, low, clouds, haze = (
-            np.array([168.0, 174, 182]),
-            np.array([204.0, 207, 210]),
-            0.5,
-            170.0,
-        )
+        top, low = np.array([168.0, 174, 182]), np.array([204.0, 207, 210])
+        clouds, haze = 0.5, 170.0
     elif kind == "dusk":
         height = math.radians(float(rng.uniform(7, 16)))
         sun, ambient = np.array([0.62, 0.40, 0.22]), np.array([0.27, 0.29, 0.38])
         top, low = np.array([72.0, 92, 142]), np.array([222.0, 166, 122])
         noise *= 1.5
     elif kind == "night":
-        # A crossing is lit, and a camera turns up its gain: in the darkest, too, a person who
-        # looks closely makes everybody out.
+        # A crossing is lit and a camera raises its gain: everyone can be made out on a close look.
         sun, ambient = np.zeros(3), np.array([0.15, 0.16, 0.21]) * float(rng.uniform(1.2, 1.8))
         top, low, clouds, haze = np.array([10.0, 12, 22]), np.array([38.0, 34, 38]), 0.15, 300.0
         noise *= 1.7
     elif kind == "glare":
-        # In the picture: within 50 degrees of north, where the usual camera looks, and low.
+        # In the picture: within 50 degrees of north, where the default camera looks, and low.
         azimuth = math.radians(90 + float(rng.uniform(-50, 50)))
         height = math.radians(float(rng.uniform(9, 24)))
         sun, ambient = np.array([0.85, 0.78, 0.64]), np.array([0.36, 0.37, 0.40])
@@ -120,14 +115,9 @@ def lighting(conditions: Conditions) -> Lighting:
         low = 0.4 * low + 0.6 * float(low @ grey)
         clouds, haze, glare, noise = 0.6, haze * 0.45, glare * 0.35, noise * 1.2
     tint = gain * np.array([1 + warm, 1.0, 1 - warm])
+    level = math.cos(height)
     return Lighting(
-        to_sun=np.array(
-            [
-                math.cos(azimuth) * math.cos(height),
-                math.sin(azimuth) * math.cos(height),
-                math.sin(height),
-            ]
-        ),
+        to_sun=np.array([math.cos(azimuth) * level, math.sin(azimuth) * level, math.sin(height)]),
         sun=sun * tint,
         ambient=ambient * tint,
         sky_top=top * gain,

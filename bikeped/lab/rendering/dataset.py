@@ -21,23 +21,21 @@ from bikeped.lab.rendering.render_camera import SceneCamera
 from bikeped.types import ImageArray, Kind
 
 CATEGORIES = [{"id": kind.value + 1, "name": kind.label} for kind in Kind]
-#: Less than this share of somebody to be seen, or a box smaller than this, is no annotation to
-#: learn from or to be judged by: it is kept and marked as a crowd, which COCO's measures ignore.
+#: An object with a smaller visible share or box is marked as a crowd, which COCO's measures ignore.
 MIN_VISIBLE = 0.3
 MIN_SIDE_PX = 5.0
-PICTURES_A_STREET = 4  #: pictures that share a street, which costs more than who is on it
+PICTURES_A_STREET = 4  #: a street takes longer to draw than its road users
 
 
 @dataclass(frozen=True)
 class DrawnPicture:
-    """One picture [h, w, 3] RGB, everybody in it, and what stands there without being anybody."""
+    """One picture [h, w, 3] RGB, the road users and the fixtures in it."""
 
     image: ImageArray
     objects: list[DrawnObject]
     conditions: Conditions
     camera: SceneCamera
-    #: As `ScenePainter.furniture` has it, and everybody's `shadow`.
-    furniture: list[tuple[str, Box]]
+    furniture: list[tuple[str, Box]]  #: `ScenePainter.furniture`, and each agent's `shadow`
 
 
 def pictures(
@@ -49,11 +47,10 @@ def pictures(
     lens: str = "fisheye",
     mix: SceneMix = DEFAULT_MIX,
 ) -> Iterator[DrawnPicture]:
-    """`count` drawn pictures with their objects: random scenarios, lights, weathers and places.
+    """Draws `count` pictures of random scenarios, lights, weathers and places.
 
     `camera`: for all of them; None draws a camera for every street (`lens`: fisheye or
-    rectilinear). `mix`: of who and what is there. Equal arguments give equal pictures; a
-    larger `count` begins with the same ones.
+    rectilinear). Equal arguments give equal pictures; a larger `count` begins with the same ones.
     """
     for number in range(count):
         street = seed * 1_000_003 + number // PICTURES_A_STREET
@@ -82,9 +79,9 @@ def write_dataset(
 
     The folder appears whole or not at all, so it must not be there yet (or be empty). Annotations
     carry `visible` (share), `distance_m`, `kind` and `ignore` beside COCO's keys; hardly visible or
-    tiny ones have `iscrowd` 1. Images carry `conditions`, and in `furniture` what stands there and
-    is nobody: `what` it is, and its `bbox`, which may reach beyond the picture. Raises BikepedError
-    when the folder is taken or not writable.
+    tiny ones have `iscrowd` 1. Images carry `conditions`, and in `furniture` the fixtures: `what`
+    each is and its `bbox`, which may reach beyond the picture. Raises BikepedError when the folder
+    is taken or not writable.
     """
     if not 1 <= count <= 1_000_000:
         raise BikepedError(f"count: {count} is not 1 to 1000000 pictures")

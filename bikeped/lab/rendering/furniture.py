@@ -1,4 +1,4 @@
-"""What stands along the street as meshes."""
+"""Street furniture, trees and houses as meshes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Point, Rgb
 from bikeped.lab.rendering.street_layout import Fixture, House
 from bikeped.lab.rendering.vehicles import vehicle
 from bikeped.lab.scenarios.scenario import SIZES_M
+from bikeped.types import FloatArray
 
 _STEEL: Rgb = (96, 100, 106)
 LAMP_HEAD_M = (1.6, 5.9)  #: how far over the road and how high a street lamp shines
-
-
 #: Length and width of what stands on the ground.
 FOOTPRINT_M: dict[str, tuple[float, float]] = {
     "car": (4.5, 1.8),
@@ -50,14 +49,20 @@ def _lamp(b: MeshBuilder, rng: np.random.Generator) -> None:
 def _sign(b: MeshBuilder, rng: np.random.Generator) -> None:
     b.limb((0, 0, 0.02), (0, 0, 2.5), 0.035, 0.03, (150, 152, 156))
     colour = ((200, 40, 40), (30, 80, 170), (240, 200, 40))[int(rng.integers(3))]
-    turn = np.linspace(0, 2 * np.pi, 4 + 4 * int(rng.integers(1, 4)) + 1)[:-1]
-    for r, shade, x in ((0.32, (240, 240, 236), 0.045), (0.27, colour, 0.05)):
-        rim = np.stack([np.full(len(turn), x), r * np.cos(turn), 2.3 + r * np.sin(turn)], axis=1)
-        middle = np.broadcast_to(np.array([x, 0, 2.3]), rim.shape)
-        plate = np.stack([middle, rim, np.roll(rim, -1, axis=0), middle], axis=1)
-        b.faces(plate, shade, layer=1 if r > 0.3 else 2)
-        if r > 0.3:
+    corners = 4 + 4 * int(rng.integers(1, 4))
+    for r, shade, x, layer in ((0.32, (240, 240, 236), 0.045, 1), (0.27, colour, 0.05, 2)):
+        plate = _disc(x, 2.3, r, corners)
+        b.faces(plate, shade, layer=layer)
+        if layer == 1:
             b.faces(plate[:, ::-1] * (-1, 1, 1), (120, 122, 126), layer=1)
+
+
+def _disc(x: float, z: float, radius: float, corners: int) -> FloatArray:
+    """Faces [corners, 4, 3] of an upright disc about (x, 0, z) that faces forward."""
+    turn = np.linspace(0, 2 * np.pi, corners + 1)[:-1]
+    rim = np.stack([np.full(corners, x), radius * np.cos(turn), z + radius * np.sin(turn)], axis=1)
+    middle = np.broadcast_to(np.array([x, 0, z]), rim.shape)
+    return np.stack([middle, rim, np.roll(rim, -1, axis=0), middle], axis=1)
 
 
 def _signal(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -70,10 +75,7 @@ def _signal(b: MeshBuilder, rng: np.random.Generator) -> None:
         (2.38, (50, 220, 110), green),
     ):
         shade = colour if on else tuple(c * 0.25 for c in colour)
-        turn = np.linspace(0, 2 * np.pi, 13)
-        rim = np.stack([np.full(13, 0.205), 0.09 * np.cos(turn), z + 0.09 * np.sin(turn)], axis=1)
-        middle = np.broadcast_to(np.array([0.205, 0, z]), rim[:-1].shape)
-        b.faces(np.stack([middle, rim[:-1], rim[1:], middle], axis=1), shade, 0.9 if on else 0.0, 1)
+        b.faces(_disc(0.205, z, 0.09, 12), shade, 0.9 if on else 0.0, 1)
 
 
 def _bin(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -129,98 +131,72 @@ def _tree(rng: np.random.Generator, count: int) -> Mesh:
 def house(item: House, lit_windows: bool) -> Mesh:
     """A house: front and ends in cells of one window each."""
     rng = np.random.default_rng(item.number)
-    quads: list[list[Point]] = []
-    colours: list[Rgb] = []
-    glows: list[float] = []
-    layers: list[int] = []
-
-    def add(face: list[Point], colour: Rgb, glow: float = 0.0, layer: int = 0) -> None:
-        quads.append(face)
-        colours.append(colour)
-        glows.append(glow)
-        layers.append(layer)
-
+    faces: list[tuple[list[Point], Rgb, float, int]] = []  # corners, colour, glow, layer
     floors = max(int((item.height - 0.8) / 3.0), 1)
     columns = max(int((item.x1 - item.x0) / 2.6), 1)
     pitch, storey = (item.x1 - item.x0) / columns, item.height / floors
     shop = rng.random() < 0.4
     north = item.front > 0
-    y = item.front if north else item.front + item.depth
+    front_y = item.front if north else item.front + item.depth
     out = -0.02 if north else 0.02
     frame: Rgb = (222, 218, 208) if rng.random() < 0.6 else (70, 66, 62)
 
     def front(
         x0: float, x1: float, z0: float, z1: float, colour: Rgb, layer: int, glow: float = 0.0
     ) -> None:
-        face = [
-            (x0, y + out * layer, z0),
-            (x1, y + out * layer, z0),
-            (x1, y + out * layer, z1),
-            (x0, y + out * layer, z1),
-        ]
-        add(face if north else face[::-1], colour, glow, layer)
+        y = front_y + out * layer
+        face = [(x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1)]
+        faces.append((face if north else face[::-1], colour, glow, layer))
 
+    xs = [item.x0 + column * pitch for column in range(columns)]
     for floor in range(floors):
         z = floor * storey
-        for column in range(columns):
-            x = item.x0 + column * pitch
-            tint = 1 + float(rng.normal(0, 0.012))
-            wall: Rgb = tuple(c * tint for c in item.wall)  # type: ignore[assignment]
+        for column, x in enumerate(xs):
+            wall = _scaled(item.wall, 1 + float(rng.normal(0, 0.012)))
             front(x, x + pitch, z, z + storey, wall, 0)
             lit = lit_windows and rng.random() < 0.35
             pane: Rgb = (
                 (250, 208, 130) if lit else tuple(np.array([74.0, 92, 108]) * rng.uniform(0.7, 1.3))
             )
-            glow = 0.75 if lit else 0.0
+            m = x + pitch / 2
             if floor == 0 and shop:
-                pane = (250, 224, 170) if lit_windows else pane
-                front(
-                    x + 0.15,
-                    x + pitch - 0.15,
-                    0.4,
-                    storey - 0.7,
-                    pane,
-                    2,
-                    0.8 if lit_windows else 0,
-                )
-            elif floor == 0 and column == columns // 2:
-                front(x + pitch / 2 - 0.6, x + pitch / 2 + 0.6, 0, 2.3, frame, 1)
-                front(x + pitch / 2 - 0.5, x + pitch / 2 + 0.5, 0, 2.2, (84, 52, 44), 2)
+                pane, glow = ((250, 224, 170), 0.8) if lit_windows else (pane, 0.0)
+                front(x + 0.15, x + pitch - 0.15, 0.4, storey - 0.7, pane, 2, glow)
+            elif floor == 0 and column == columns // 2:  # the door
+                front(m - 0.6, m + 0.6, 0, 2.3, frame, 1)
+                front(m - 0.5, m + 0.5, 0, 2.2, (84, 52, 44), 2)
             else:
                 w, low, high = pitch * 0.26, z + storey * 0.3, z + storey * 0.8
-                m = x + pitch / 2
                 front(m - w - 0.1, m + w + 0.1, low - 0.1, high + 0.1, frame, 1)
-                front(m - w, m + w, low, high, pane, 2, glow)
+                front(m - w, m + w, low, high, pane, 2, 0.75 if lit else 0.0)
                 front(m - 0.03, m + 0.03, low, high, frame, 3)
         if floor == 0 and shop:
             band: Rgb = tuple(rng.uniform(40, 210, 3))
-            for column in range(columns):
-                x = item.x0 + column * pitch
+            for x in xs:
                 front(x, x + pitch, storey - 0.6, storey - 0.1, band, 2)
-    for column in range(columns):
-        x = item.x0 + column * pitch
-        front(x, x + pitch, item.height - 0.35, item.height, tuple(c * 0.7 for c in item.wall), 1)  # type: ignore[arg-type]
-    back = item.front + item.depth
-    ys = np.linspace(item.front, back, 5).tolist()
+    for x in xs:
+        front(x, x + pitch, item.height - 0.35, item.height, _scaled(item.wall, 0.7), 1)
+    ys = np.linspace(item.front, item.front + item.depth, 5).tolist()
     for x, order in ((item.x0, 1), (item.x1, -1)):
         for floor in range(floors):
             z0, z1 = floor * storey, (floor + 1) * storey
             for y0, y1 in pairwise(ys):
                 face = [(x, y1, z0), (x, y0, z0), (x, y0, z1), (x, y1, z1)]
-                add(face[::order], tuple(c * 0.9 for c in item.wall))  # type: ignore[arg-type]
+                faces.append((face[::order], _scaled(item.wall, 0.9), 0.0, 0))
                 if (item.number >> floor) % 2:
                     p, q = y0 + 0.3 * (y1 - y0), y0 + 0.7 * (y1 - y0)
-                    e = -0.02 * order
-                    pane_quad = [
-                        (x + e, q, z0 + 1),
-                        (x + e, p, z0 + 1),
-                        (x + e, p, z1 - 0.7),
-                        (x + e, q, z1 - 0.7),
-                    ]
-                    add(pane_quad[::order], (74, 88, 102), layer=2)
+                    e, low, high = x - 0.02 * order, z0 + 1, z1 - 0.7
+                    window = [(e, q, low), (e, p, low), (e, p, high), (e, q, high)]
+                    faces.append((window[::order], (74, 88, 102), 0.0, 2))
+    quads, colours, glows, layers = zip(*faces, strict=True)
     return Mesh(
         np.array(quads, np.float64),
         np.array(colours, np.float64),
         np.array(glows),
         np.array(layers, np.int8),
     )
+
+
+def _scaled(colour: Rgb, factor: float) -> Rgb:
+    r, g, b = colour
+    return r * factor, g * factor, b * factor

@@ -1,4 +1,4 @@
-"""The ground seen from above: roads, markings, kerbs and paving as maps at two scales."""
+"""Maps of the ground from above: roads, markings, kerbs and paving."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from bikeped.lab.rendering.mesh import Rgb
 from bikeped.lab.rendering.street_layout import StreetLayout
-from bikeped.types import Float32Array, ImageArray
+from bikeped.types import Float32Array, FloatArray, ImageArray
 
 _WHITE: Rgb = (228, 229, 224)
 _YELLOW: Rgb = (222, 176, 60)
@@ -38,8 +38,7 @@ def noise_tile(seed: int, size: int = 512) -> Float32Array:
         k = size // cells
         big = np.asarray(cv2.resize(ring, None, fx=k, fy=k, interpolation=cv2.INTER_CUBIC))
         total += weight * big[2 * k : 2 * k + size, 2 * k : 2 * k + size]
-    scaled: Float32Array = (total / total.std()).astype(np.float32)
-    return scaled
+    return np.asarray(total / total.std(), np.float32)
 
 
 class MapCanvas:
@@ -48,32 +47,28 @@ class MapCanvas:
     def __init__(self, image: ImageArray, x0: float, y0: float, res: float) -> None:
         self.image, self.x0, self.y0, self.res = image, x0, y0, res
 
+    def _pixels(self, points: list[tuple[float, float]]) -> FloatArray:
+        return np.asarray((np.array(points) - (self.x0, self.y0)) / self.res - 0.5)
+
     def rect(
         self, x0: float, y0: float, x1: float, y1: float, colour: Rgb, share: float = 1.0
     ) -> None:
         self.poly([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], colour, share)
 
     def poly(self, points: list[tuple[float, float]], colour: Rgb, share: float = 1.0) -> None:
-        at = (np.array(points) - (self.x0, self.y0)) / self.res - 0.5
+        at = self._pixels(points)
         low = np.maximum(np.floor(at.min(axis=0)).astype(int) - 1, 0)
-        high = np.minimum(
-            np.ceil(at.max(axis=0)).astype(int) + 2, (self.image.shape[1], self.image.shape[0])
-        )
+        high = np.minimum(np.ceil(at.max(axis=0)).astype(int) + 2, self.image.shape[1::-1])
         if (high <= low).any():
             return
         part = self.image[low[1] : high[1], low[0] : high[0]]
         fixed = np.round((at - low).clip(-1e5, 1e5) * (1 << _SHIFT)).astype(np.int32)
-        if share >= 1:
-            flat = np.ascontiguousarray(part)
-            cv2.fillPoly(flat, [fixed], colour, cv2.LINE_AA, _SHIFT)
-            part[:] = flat
-        else:
-            flat = part.copy()
-            cv2.fillPoly(flat, [fixed], colour, cv2.LINE_AA, _SHIFT)
-            part[:] = cv2.addWeighted(flat, share, part, 1 - share, 0)
+        flat = part.copy()
+        cv2.fillPoly(flat, [fixed], colour, cv2.LINE_AA, _SHIFT)
+        part[:] = flat if share >= 1 else cv2.addWeighted(flat, share, part, 1 - share, 0)
 
     def line(self, points: list[tuple[float, float]], wide_m: float, colour: Rgb) -> None:
-        at = (np.array(points) - (self.x0, self.y0)) / self.res - 0.5
+        at = self._pixels(points)
         fixed = np.round(at.clip(-1e5, 1e5) * (1 << _SHIFT)).astype(np.int32)
         thick = max(round(wide_m / self.res), 1)
         cv2.polylines(self.image, [fixed], False, colour, thick, cv2.LINE_AA, _SHIFT)
@@ -184,15 +179,8 @@ def _bicycle_sign(canvas: MapCanvas, x: float, y: float, way: int) -> None:
     for hub in (-0.5, 0.5):
         ring = [(x + way * (hub + 0.32 * np.cos(a)), y + 0.32 * np.sin(a)) for a in turn]
         canvas.line(ring, 0.07, _WHITE)
-    frame = (
-        (-0.5, 0),
-        (-0.1, 0.05),
-        (0.35, 0.5),
-        (-0.2, 0.5),
-        (-0.5, 0),
-        (-0.2, 0.5),
-        (-0.1, 0.05),
-    )
+    low, crank, bar, seat = (-0.5, 0), (-0.1, 0.05), (0.35, 0.5), (-0.2, 0.5)
+    frame = (low, crank, bar, seat, low, seat, crank)
     canvas.line([(x + way * a, y + way * b) for a, b in frame], 0.07, _WHITE)
     canvas.line([(x + way * 0.5, y), (x + way * 0.32, y + way * 0.68)], 0.07, _WHITE)
 
@@ -240,11 +228,7 @@ def _textured(image: ImageArray, layout: StreetLayout, res: float) -> ImageArray
     grain = np.tile(np.roll(grain, tuple(rows.tolist()), (0, 1)), repeat)[:height, :width]
     # Stains of some metres: the same noise, drawn large.
     part_y, part_x = (min(max(int(n * res * 2), 8), 512) for n in (height, width))
-    big = np.asarray(
-        cv2.resize(tile[:part_y, :part_x], (width, height), interpolation=cv2.INTER_LINEAR)
-    )
+    part = np.ascontiguousarray(tile[:part_y, :part_x])
+    big = np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR))
     grain = grain + 0.035 * np.clip(big, -2.5, 2.5)
-    out: ImageArray = np.asarray(
-        cv2.multiply(image, cv2.merge([grain] * 3), dtype=cv2.CV_8U), np.uint8
-    )
-    return out
+    return np.asarray(cv2.multiply(image, cv2.merge([grain] * 3), dtype=cv2.CV_8U), np.uint8)

@@ -1,4 +1,4 @@
-"""What is to be seen of everybody in a picture: who hides whom, and tight boxes. Pure."""
+"""Labels of a picture: visible silhouettes behind occluders, and their tight boxes. Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.geometry import CameraPose
-from bikeped.lab.rendering.sprite import Sprite, inside, touch
+from bikeped.lab.rendering.sprite import Sprite, overlapping_slices, sprites_overlap
 from bikeped.types import BoolArray, Float32Array, FloatArray, Kind
 
 #: What each kind of agent counts as: the default configuration's classes.
@@ -19,7 +19,7 @@ KINDS: dict[str, Kind] = {
     "bus": Kind.VEHICLE,
     "truck": Kind.VEHICLE,
 }
-_MIN_COVERAGE = 0.4  #: coverage of a pixel from which on it belongs to somebody
+_MIN_COVERAGE = 0.4  #: coverage of a pixel that belongs to the silhouette
 _MIN_PX = 1.5  #: smaller than this on a side is not in the picture
 
 
@@ -52,7 +52,7 @@ class DrawnObject:
 
 @dataclass(frozen=True)
 class Occluder:
-    """Somebody or something that hides what is behind it; with a `kind`, it gets a label."""
+    """A sprite that hides what is behind it; with a `kind` it gets a label."""
 
     sprite: Sprite
     id: int
@@ -62,26 +62,25 @@ class Occluder:
 
 
 def label(
-    candidates: list[Occluder], lit: BoolArray, pose: CameraPose, size: tuple[int, int]
+    occluders: list[Occluder], lit: BoolArray, pose: CameraPose, size: tuple[int, int]
 ) -> list[DrawnObject]:
-    """Objects of the `candidates` that have a kind, far ones first as given, as far as they show.
+    """Labels of the `occluders` that have a kind and show; they are given far ones first.
 
-    `lit` [h, w]: where the lens reaches, and lets light enough through to see by.
+    `lit` [h, w]: where the lens shows the scene with enough light.
     """
     left: list[Float32Array | None] = []
-    for i, near in enumerate(candidates):
-        for far, cover in zip(candidates[:i], left, strict=True):
-            if cover is not None and touch(far.sprite, near.sprite):
+    for i, near in enumerate(occluders):
+        for far, cover in zip(occluders[:i], left, strict=True):
+            if cover is not None and sprites_overlap(far.sprite, near.sprite):
                 _hide(cover, far.sprite, near.sprite)
         whole = np.asarray(near.sprite.alpha, np.float32) / np.float32(255)
         left.append(whole if near.kind is not None else None)
-    found = []
-    for item, cover in zip(candidates, left, strict=True):
-        if cover is not None and item.kind is not None:
-            drawn = _drawn(item, item.kind, cover, lit, pose, size)
-            if drawn is not None:
-                found.append(drawn)
-    return found
+    found = [
+        _label(item, item.kind, cover, lit, pose, size)
+        for item, cover in zip(occluders, left, strict=True)
+        if cover is not None and item.kind is not None
+    ]
+    return [item for item in found if item is not None]
 
 
 def _hide(cover: Float32Array, far: Sprite, near: Sprite) -> None:
@@ -95,7 +94,7 @@ def _hide(cover: Float32Array, far: Sprite, near: Sprite) -> None:
     cover[y0:y1, x0:x1] *= 1 - over.astype(np.float32) / 255
 
 
-def _drawn(
+def _label(
     item: Occluder,
     kind: str,
     cover: Float32Array,
@@ -104,7 +103,7 @@ def _drawn(
     size: tuple[int, int],
 ) -> DrawnObject | None:
     sprite = item.sprite
-    spot = inside(size, sprite.left, sprite.top, cover.shape[1], cover.shape[0])
+    spot = overlapping_slices(size, sprite.left, sprite.top, cover.shape[1], cover.shape[0])
     if spot is None:
         return None
     rows, columns, patch_rows, patch_columns = spot
@@ -113,19 +112,12 @@ def _drawn(
     across, down = np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1))
     if len(across) == 0:
         return None
-    raw = np.array(
-        [
-            columns.start + across[0],
-            rows.start + down[0],
-            columns.start + across[-1] + 1,
-            rows.start + down[-1] + 1,
-        ],
-        np.float64,
-    )
+    raw = np.array([across[0], down[0], across[-1] + 1, down[-1] + 1], np.float64)
+    raw += np.array([columns.start, rows.start] * 2)
     # Where the silhouette's own edge shows, it is known better than to a pixel.
     full = np.array(sprite.full_box_px)
     box = np.where(np.abs(raw - full) <= 1.5, full, raw)
-    box = np.clip(box, 0.0, (size[0], size[1], size[0], size[1]))
+    box = np.clip(box, 0.0, (*size, *size))
     if (box[2:] - box[:2] < _MIN_PX).any():
         return None
     ground = pose.world_to_ground(item.xy_m)
@@ -133,10 +125,10 @@ def _drawn(
         id=item.id,
         kind=kind,
         label=KINDS[kind],
-        box_px=(float(box[0]), float(box[1]), float(box[2]), float(box[3])),
+        box_px=tuple(box.tolist()),
         full_box_px=sprite.full_box_px,
         visible=float(min(shows.sum() / max(sprite.area_px, 1e-6), 1.0)),
-        xy_m=(float(ground[0]), float(ground[1])),
-        world_m=(float(item.xy_m[0]), float(item.xy_m[1])),
+        xy_m=tuple(ground.tolist()),
+        world_m=tuple(item.xy_m.tolist()),
         heading_rad=item.heading_rad,
     )

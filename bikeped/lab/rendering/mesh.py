@@ -1,7 +1,7 @@
-"""Solids as coloured four-cornered faces: limbs, lofts, boxes and wheels. Pure.
+"""Solids of coloured quads: limbs, lofts, boxes and wheels. Pure.
 
-Body axes are x forward, y left, z up, in metres. Faces run counter-clockwise seen from outside, so
-that what turns away from the camera can be left out.
+Body axes are x forward, y left, z up, in metres. Faces run counter-clockwise seen from outside,
+for back-face culling.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from bikeped.types import FloatArray
 
 Rgb = tuple[float, float, float]
 Point = tuple[float, float, float]
+Size = tuple[float, float, float]  #: length, width, height in metres
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """Something that shines: place [3] in metres, its colour, its strength (a headlight is 1)."""
+    """A light: place [3] in metres, colour, strength (a headlight is 1)."""
 
     at: FloatArray
     colour: Rgb
@@ -53,15 +54,7 @@ class Mesh:
         return Mesh(self.quads @ turn.T + shift, self.colours, self.glow, self.layer, lamps)
 
 
-def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """All of them as one."""
-    return Mesh(
-        np.concatenate([m.quads for m in meshes]),
-        np.concatenate([m.colours for m in meshes]),
-        np.concatenate([m.glow for m in meshes]),
-        np.concatenate([m.layer for m in meshes]),
-        tuple(lamp for m in meshes for lamp in m.lamps),
-    )
+_Faces = tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.int8]]  #: as `Mesh` has them
 
 
 @dataclass
@@ -69,10 +62,7 @@ class MeshBuilder:
     """Collects faces; `sides` is how many a round limb has."""
 
     sides: int = 8
-    _quads: list[FloatArray] = field(default_factory=list)
-    _colours: list[FloatArray] = field(default_factory=list)
-    _glow: list[FloatArray] = field(default_factory=list)
-    _layer: list[npt.NDArray[np.int8]] = field(default_factory=list)
+    _faces: list[_Faces] = field(default_factory=list)
     _limbs: list[tuple[Point, Point, float, float, Rgb, int]] = field(default_factory=list)
     _lamps: list[Lamp] = field(default_factory=list)
 
@@ -81,10 +71,9 @@ class MeshBuilder:
     ) -> None:
         """Faces [n, 4, 3] in one colour [3] or one a face [n, 3]."""
         array = np.asarray(quads, np.float64).reshape(-1, 4, 3)
-        self._quads.append(array)
-        self._colours.append(np.broadcast_to(np.asarray(colour, np.float64), (len(array), 3)))
-        self._glow.append(np.full(len(array), glow))
-        self._layer.append(np.full(len(array), layer, np.int8))
+        count = len(array)
+        colours = np.broadcast_to(np.asarray(colour, np.float64), (count, 3))
+        self._faces.append((array, colours, np.full(count, glow), np.full(count, layer, np.int8)))
 
     def limb(
         self, a: Point, b: Point, radius_a: float, radius_b: float, colour: Rgb, layer: int = 0
@@ -110,14 +99,10 @@ class MeshBuilder:
         u = np.asarray(across, np.float64)
         v = cross_product(way / max(math.sqrt(float(way @ way)), 1e-9), u)
         turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-        ring = (
-            c[:, None]
-            + r[:, :1, None] * np.cos(turn)[:, None] * u
-            + r[:, 1:, None] * np.sin(turn)[:, None] * v
-        )
-        quads = _bands(ring)
+        ring = c[:, None] + r[:, :1, None] * np.cos(turn)[:, None] * u
+        ring += r[:, 1:, None] * np.sin(turn)[:, None] * v
         bands = np.broadcast_to(np.asarray(colour, np.float64), (len(c) - 1, 3))
-        self.faces(quads, np.repeat(bands, sides, axis=0), layer=layer)
+        self.faces(_bands(ring), np.repeat(bands, sides, axis=0), layer=layer)
 
     def ball(self, at: Point, radii: Point, colour: npt.ArrayLike, layer: int = 0) -> None:
         """An ellipsoid of half axes `radii` (forward, left, up)."""
@@ -128,9 +113,8 @@ class MeshBuilder:
         centres[:, 2] = up * radii[2]
         centres += at
         # Across is left; the other way, up x left, is backward: the sign does not matter to it.
-        self.loft(
-            centres, np.stack([wide * radii[1], wide * radii[0]], axis=1), colour, layer=layer
-        )
+        across = np.stack([wide * radii[1], wide * radii[0]], axis=1)
+        self.loft(centres, across, colour, layer=layer)
 
     def box(
         self,
@@ -179,31 +163,16 @@ class MeshBuilder:
         # Out, left, in, right about the tube; outside is where the ring order runs to the left.
         for along, left in ((1.0, 0.0), (0.0, -1.0), (-1.0, 0.0), (0.0, 1.0)):
             r = radius - tube + along * tube
-            rings.append(
-                np.stack(
-                    [
-                        hub[0] + r * np.cos(turn),
-                        np.full(steps, hub[1] + left * tube),
-                        hub[2] + r * np.sin(turn),
-                    ],
-                    axis=1,
-                )
-            )
+            rings.append(_circle((hub[0], hub[1] + left * tube, hub[2]), r, turn))
         closed = np.stack([*rings, rings[0]])
         self.faces(_bands(closed)[:, ::-1], colour)
         for i in range(spokes):
             a = turned + i * math.pi / spokes
             f, u = (radius - tube) * math.cos(a), (radius - tube) * math.sin(a)
-            wide, high = -0.006 * math.sin(a), 0.006 * math.cos(a)
-            one, other = (hub[0] - f, hub[2] - u), (hub[0] + f, hub[2] + u)
-            ribbon = np.array(
-                [
-                    (one[0] - wide, hub[1], one[1] - high),
-                    (other[0] - wide, hub[1], other[1] - high),
-                    (other[0] + wide, hub[1], other[1] + high),
-                    (one[0] + wide, hub[1], one[1] + high),
-                ]
-            )
+            spoke = np.array([f, 0, u])
+            one, other = np.array(hub) - spoke, np.array(hub) + spoke
+            half = np.array([-0.006 * math.sin(a), 0, 0.006 * math.cos(a)])
+            ribbon = np.array([one - half, other - half, other + half, one + half])
             self.faces(np.stack([ribbon, ribbon[::-1]]), spoke_colour)
 
     def disc(
@@ -211,14 +180,7 @@ class MeshBuilder:
     ) -> None:
         """A round plate facing left (`left` 1) or right (-1)."""
         turn = np.linspace(0, 2 * np.pi, steps + 1)
-        rim = np.stack(
-            [
-                hub[0] + radius * np.cos(turn),
-                np.full(steps + 1, hub[1]),
-                hub[2] + radius * np.sin(turn),
-            ],
-            axis=1,
-        )
+        rim = _circle(hub, radius, turn)
         middle = np.broadcast_to(np.array(hub), rim[:-1].shape)
         quads = np.stack([middle, rim[1:], rim[:-1], middle], axis=1)
         self.faces(quads if left > 0 else quads[:, ::-1], colour, layer=layer)
@@ -231,22 +193,17 @@ class MeshBuilder:
         """All that was collected."""
         if self._limbs:
             self._build_limbs()
-        return Mesh(
-            np.concatenate(self._quads),
-            np.concatenate(self._colours),
-            np.concatenate(self._glow),
-            np.concatenate(self._layer),
-            tuple(self._lamps),
+        quads, colours, glow, layer = (
+            np.concatenate(part) for part in zip(*self._faces, strict=True)
         )
+        return Mesh(quads, colours, glow, layer, tuple(self._lamps))
 
     def _build_limbs(self) -> None:
         """All limbs at once: six rings each, the outer ones shrunk to the rounded ends."""
-        a = np.array([limb[0] for limb in self._limbs], np.float64)
-        b = np.array([limb[1] for limb in self._limbs], np.float64)
-        ra = np.array([limb[2] for limb in self._limbs])
-        rb = np.array([limb[3] for limb in self._limbs])
-        colour = np.array([limb[4] for limb in self._limbs], np.float64)
-        layer = np.array([limb[5] for limb in self._limbs], np.int8)
+        ends_a, ends_b, radii_a, radii_b, colours, layers = zip(*self._limbs, strict=True)
+        a, b = np.array(ends_a, np.float64), np.array(ends_b, np.float64)
+        ra, rb = np.array(radii_a), np.array(radii_b)
+        colour, layer = np.array(colours, np.float64), np.array(layers, np.int8)
         self._limbs = []
         way = b - a
         length = np.linalg.norm(way, axis=1, keepdims=True)
@@ -264,19 +221,13 @@ class MeshBuilder:
             along = np.stack([-ra, -0.3 * ra, end + 0.3 * rb, end + rb], axis=1)
         centre = a[:, None] + along[..., None] * d[:, None]
         turn = np.linspace(0, 2 * np.pi, self.sides, endpoint=False)
-        spread = (
-            np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * v[:, None]
-        )  # [m, sides, 3]
+        # [m, sides, 3]
+        spread = np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * v[:, None]
         ring = centre[:, :, None] + radius[:, :, None, None] * spread[:, None]
-        following = np.roll(ring, -1, axis=2)
-        quads = np.stack(
-            [ring[:, :-1], following[:, :-1], following[:, 1:], ring[:, 1:]], axis=3
-        ).reshape(-1, 4, 3)
+        quads = _bands(ring)
         per = len(quads) // len(a)
-        self._quads.append(quads)
-        self._colours.append(np.repeat(colour, per, axis=0))
-        self._glow.append(np.zeros(len(quads)))
-        self._layer.append(np.repeat(layer, per))
+        glow = np.zeros(len(quads))
+        self._faces.append((quads, np.repeat(colour, per, axis=0), glow, np.repeat(layer, per)))
 
 
 def cross_product(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -288,15 +239,21 @@ def cross_product(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
+def _circle(middle: Point, radius: float, turn: npt.NDArray[np.floating]) -> FloatArray:
+    """Points [n, 3] of an upright circle along x, at the angles `turn` [n]."""
+    x, y, z = middle
+    return np.stack(
+        [x + radius * np.cos(turn), np.full(len(turn), y), z + radius * np.sin(turn)], axis=1
+    )
+
+
 def normals(quads: FloatArray) -> FloatArray:
     """Outward directions [n, 3] of faces [n, 4, 3], not of unit length."""
     return cross_product(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
 
 
 def _bands(rings: FloatArray) -> FloatArray:
-    """Faces [(r - 1) * s, 4, 3] between neighbouring rings [r, s, 3]."""
-    following = np.roll(rings, -1, axis=1)
-    quads: FloatArray = np.stack(
-        [rings[:-1], following[:-1], following[1:], rings[1:]], axis=2
-    ).reshape(-1, 4, 3)
-    return quads
+    """Faces [n * (r - 1) * s, 4, 3] between neighbouring rings [..., r, s, 3]."""
+    low, high = rings[..., :-1, :, :], rings[..., 1:, :, :]
+    corners = [low, np.roll(low, -1, axis=-2), np.roll(high, -1, axis=-2), high]
+    return np.stack(corners, axis=-2).reshape(-1, 4, 3)

@@ -1,4 +1,4 @@
-"""Scenarios as pictures, with the exact box of everybody in them."""
+"""Draws a scenario as pictures, with the exact box of every road user in them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from bikeped.lab.rendering.backdrop import FixtureSprite, backdrop
-from bikeped.lab.rendering.compositing import darken, footprint, paste_sprite, shine
+from bikeped.lab.rendering.compositing import add_glow, contact_shadow, darken, paste_sprite
 from bikeped.lab.rendering.conditions import Conditions
 from bikeped.lab.rendering.furniture import FOOTPRINT_M, POLE_FOOTPRINT_M
 from bikeped.lab.rendering.labels import DrawnObject, Occluder, label
@@ -16,27 +16,28 @@ from bikeped.lab.rendering.mesh import Mesh
 from bikeped.lab.rendering.people import Appearance, person
 from bikeped.lab.rendering.render_camera import SceneCamera
 from bikeped.lab.rendering.riders import rider
-from bikeped.lab.rendering.sprite import Sprite, rasterise, shadow, touch
+from bikeped.lab.rendering.sprite import Sprite, rasterise, shadow, sprites_overlap
 from bikeped.lab.rendering.vehicles import vehicle
 from bikeped.lab.rendering.weather import Weather
 from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.types import FloatArray, ImageArray
 
-_PATH_CLEAR_M = 1.1  #: fixtures nearer than this to somebody's path are left out
+_PATH_CLEAR_M = 1.1  #: fixtures nearer than this to an agent's path are left out
 _ROUND_LIMBS_PX = 90.0  #: figures smaller than this need no round limbs
 _USUAL = Conditions()
-#: Of the light in the middle of the picture: less, in the black of the lens' rim, shows nobody.
+#: Share of the light in the middle of the picture below which, at the lens' rim, nothing shows.
 _MIN_VIGNETTE = 0.15
+_Area = tuple[float, float]  #: length and width on the ground
 Box = tuple[float, float, float, float]  #: u1, v1, u2, v2 in pixels of the picture
 
 
 @dataclass(frozen=True)
 class _SceneItem:
-    """Somebody or something in a picture; `mesh` of agents only, who are drawn anew each time."""
+    """An agent, with its `mesh`, or a fixture of the backdrop, without one."""
 
-    candidate: Occluder
+    occluder: Occluder
     mesh: Mesh | None = None
-    size_m: tuple[float, float] = (0.5, 0.5)
+    size_m: _Area = (0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,9 @@ class _FrameCache:
 class ScenePainter:
     """Draws one scenario for one camera and one set of conditions.
 
-    The street is drawn once (and shared by painters of the same camera and conditions); a picture
-    draws who moves. The same arguments give the same bytes. Fixtures of the place that somebody of
-    the scenario would run into are left out.
+    The street is drawn once, and shared by painters of the same camera and conditions; each picture
+    adds the agents. The same arguments give the same bytes. Fixtures on an agent's path are left
+    out.
     """
 
     def __init__(
@@ -89,27 +90,26 @@ class ScenePainter:
         return self.draw(t_s)[0]
 
     def objects(self, t_s: float) -> list[DrawnObject]:
-        """Everybody who is to be seen at `t_s`: agents in their order, then parked cars."""
+        """Visible road users at `t_s`: agents in their order, then parked cars."""
         if self._last is not None and self._last.t_s == t_s:
             return list(self._last.objects)
         return self._labels(self._present(t_s))
 
     def furniture(self) -> list[tuple[str, Box]]:
-        """What stands in the picture and is nobody (`Fixture.what`: lamp, sign, tree, bollard and
-        the like) and its whole silhouette u1, v1, u2, v2, also where somebody hides it."""
+        """Fixtures in the picture (`Fixture.what`: lamp, sign, tree, bollard and the like) and the
+        box u1, v1, u2, v2 of each whole silhouette, hidden or not."""
         return list(self._furniture)
 
     def shadows(self, t_s: float) -> list[Box]:
-        """The boxes of the shadows that everybody throws at `t_s`, where the sun shines: they have
-        the shape of somebody and are nobody."""
-        return list(self._moment(t_s).shadows)
+        """Boxes of the agents' cast shadows at `t_s`; none without sun."""
+        return list(self._frame(t_s).shadows)
 
     def draw(self, t_s: float) -> tuple[ImageArray, list[DrawnObject]]:
         """Picture and objects at once."""
-        moment = self._moment(t_s)
-        return moment.image.copy(), list(moment.objects)
+        cached = self._frame(t_s)
+        return cached.image.copy(), list(cached.objects)
 
-    def _moment(self, t_s: float) -> _FrameCache:
+    def _frame(self, t_s: float) -> _FrameCache:
         if self._last is None or self._last.t_s != t_s:
             shown = self._present(t_s)
             image, shadows = self._picture(shown, t_s)
@@ -126,17 +126,12 @@ class ScenePainter:
             xy, heading = state
             away = float(np.hypot(*(xy - self.camera.eye_m[:2])))
             mesh = self._mesh(agent, t, away).placed(xy, heading)
-            sprite = rasterise(
-                mesh,
-                self.camera,
-                self.backdrop.light,
-                local=self.backdrop.lamplight(xy),
-                distance_m=away,
-            )
+            light, local = self.backdrop.light, self.backdrop.lamplight(xy)
+            sprite = rasterise(mesh, self.camera, light, local=local, distance_m=away)
             if sprite is not None:
-                candidate = Occluder(sprite, agent.id, agent.kind, xy, heading)
-                found.append(_SceneItem(candidate, mesh, agent.size_m[:2]))
-        found.sort(key=lambda item: -item.candidate.sprite.distance_m)
+                occluder = Occluder(sprite, agent.id, agent.kind, xy, heading)
+                found.append(_SceneItem(occluder, mesh, agent.size_m[:2]))
+        found.sort(key=lambda item: -item.occluder.sprite.distance_m)
         return found
 
     def _mesh(self, agent: Agent, t: float, distance_m: float) -> Mesh:
@@ -154,30 +149,28 @@ class ScenePainter:
     def _picture(self, shown: list[_SceneItem], t: float) -> tuple[ImageArray, list[Box]]:
         image = self._base.copy()
         shadows = []
-        moving = [item for item in shown if item.mesh is not None]
-        for item in moving:
-            if item.mesh is not None:
-                spot = item.candidate
-                box = self._shade(image, item.mesh, spot.xy_m, item.size_m, spot.heading_rad)
-                if box is not None:
-                    shadows.append(box)
+        agents = [(item.mesh, item) for item in shown if item.mesh is not None]
+        for mesh, item in agents:
+            spot = item.occluder
+            box = self._shade(image, mesh, spot.xy_m, item.size_m, spot.heading_rad)
+            if box is not None:
+                shadows.append(box)
         drawn: list[Sprite] = []
         for item in shown:
-            sprite = item.candidate.sprite
-            # What stands is in the picture already; it is drawn again over who is behind it.
-            if item.mesh is not None or any(touch(sprite, other) for other in drawn):
+            sprite = item.occluder.sprite
+            # Fixtures are in the picture already, and drawn again over the agents behind them.
+            if item.mesh is not None or any(sprites_overlap(sprite, other) for other in drawn):
                 paste_sprite(image, self.backdrop, sprite)
                 drawn.append(sprite)
         if self.backdrop.light.lamps:
-            for item in moving:
-                if item.mesh is not None:
-                    shine(image, self.backdrop, item.mesh.lamps, item.candidate.xy_m)
+            for mesh, item in agents:
+                add_glow(image, self.backdrop, mesh.lamps, item.occluder.xy_m)
         self._weather.apply(image, t)
         cv2.bitwise_and(image, self._mask, dst=image)
         return image, shadows
 
     def _with_fixtures(self, standing: list[FixtureSprite]) -> ImageArray:
-        """The street with everything that stands on it; `standing` far ones first."""
+        """The street with its fixtures; `standing` far ones first."""
         image = self.backdrop.image.copy()
         for item in standing:
             size = FOOTPRINT_M.get(item.item.what, POLE_FOOTPRINT_M)
@@ -187,7 +180,7 @@ class ScenePainter:
         if self.backdrop.light.lamps:
             for item in standing:
                 if item.item.what == "lamp":
-                    shine(image, self.backdrop, item.mesh.lamps, None)
+                    add_glow(image, self.backdrop, item.mesh.lamps, None)
         cv2.bitwise_and(image, self._mask, dst=image)
         return image
 
@@ -199,30 +192,24 @@ class ScenePainter:
         size_m: tuple[float, float],
         heading: float,
     ) -> Box | None:
-        """The shadow that the sun throws (its box is returned), and the soft dark patch that lies
-        under everything."""
+        """Draws the shadow cast by the sun, whose box is returned, and the soft contact shadow."""
         light = self.backdrop.light
         box = None
         if light.sun.any():
-            cast = shadow(
-                mesh.quads, self.camera, light.to_sun, 1 if self.camera.size[0] < 1200 else 2
-            )
+            softness = 1 if self.camera.size[0] < 1200 else 2
+            cast = shadow(mesh.quads, self.camera, light.to_sun, softness)
             if cast is not None:
                 darken(image, self.camera.size, *cast, light.shade)
                 left, top, cover = cast
                 box = (left, top, left + cover.shape[1], top + cover.shape[0])
-        patch = footprint(self.camera, xy, size_m, heading)
+        patch = contact_shadow(self.camera, xy, size_m, heading)
         if patch is not None:
             darken(image, self.camera.size, *patch, np.array([0.6, 0.6, 0.62]))
         return box
 
     def _labels(self, shown: list[_SceneItem]) -> list[DrawnObject]:
-        found = label(
-            [item.candidate for item in shown],
-            self._seen,
-            self.camera.pose,
-            self.camera.size,
-        )
+        occluders = [item.occluder for item in shown]
+        found = label(occluders, self._seen, self.camera.pose, self.camera.size)
         order = {agent.id: i for i, agent in enumerate(self.scenario.agents)}
         return sorted(found, key=lambda o: order[o.id] if o.id >= 0 else len(order) - o.id)
 
@@ -238,7 +225,7 @@ def _fixed(standing: FixtureSprite, number: int) -> Occluder:
 
 
 def _travel(agent: Agent, t: float) -> tuple[float, bool]:
-    """Metres covered since the start, and whether the agent moves just now."""
+    """Distance travelled since the start, metres, and whether the agent is moving at `t`."""
     times = agent.path[:, 0]
     steps = np.hypot(*np.diff(agent.path[:, 1:], axis=0).T)
     way = np.concatenate([[0.0], np.cumsum(steps)])
@@ -256,7 +243,7 @@ def _resampled(path: FloatArray) -> FloatArray:
 
 
 def _blocks_path(what: str, xy: tuple[float, float], paths: FloatArray) -> bool:
-    """Whether somebody would walk or ride through this fixture."""
+    """Whether an agent's path leads through this fixture."""
     apart = np.abs(paths - np.array(xy))
     if what == "car":
         near = (apart[:, 0] < 2.4 + _PATH_CLEAR_M) & (apart[:, 1] < 0.95 + _PATH_CLEAR_M)

@@ -1,4 +1,4 @@
-"""Walkers, children and wheelchair users, posed by the way that they have covered."""
+"""Walkers, children and wheelchair users, posed by the distance they have travelled."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Point, Rgb
+from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Point, Rgb, Size
 
 SKINS: tuple[Rgb, ...] = (
     (236, 196, 170), (224, 178, 148), (198, 148, 114), (160, 112, 82), (118, 80, 60), (84, 58, 46),
@@ -27,14 +27,14 @@ LEGS: tuple[Rgb, ...] = (
 )  # fmt: skip
 SHOES: tuple[Rgb, ...] = ((32, 30, 30), (210, 208, 204), (96, 66, 44), (60, 62, 70))
 RUBBER: Rgb = (30, 30, 32)
-_STRIDE_M = 1.42  #: way of a grown walker in one full step cycle
+_STRIDE_M = 1.42  #: an adult in one full step cycle
 WHEELCHAIR_MIN_LENGTH_M = 0.7  #: a pedestrian this long sits in a wheelchair
 CHILD_MAX_HEIGHT_M = 1.4
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """What somebody wears; the same number always gives the same."""
+    """Body and clothes of a person."""
 
     skin: Rgb
     hair: Rgb
@@ -49,7 +49,7 @@ class Appearance:
     hat: Rgb | None
     bag: Rgb | None
     helmet: Rgb | None
-    pace: float  #: where in the step they start, 0..1
+    pace: float  #: phase of the step at the start, 0..1
 
     @staticmethod
     def random(rng: np.random.Generator) -> Appearance:
@@ -80,15 +80,15 @@ class Appearance:
 
 
 def person(
-    size_m: tuple[float, float, float],
+    size_m: Size,
     style: Appearance,
     travel_m: float,
     moving: bool,
     sides: int = 8,
 ) -> Mesh:
-    """A pedestrian agent's mesh in its own axes: a wheelchair user, a child or a grown walker.
+    """A pedestrian agent's mesh in its own axes: a wheelchair user, a child or an adult.
 
-    `travel_m`: what they have covered, which poses their legs; `sides`: how round limbs are.
+    `travel_m`: distance travelled, which poses the legs; `sides`: of a limb's cross-section.
     """
     if size_m[0] >= WHEELCHAIR_MIN_LENGTH_M:
         return _wheelchair(size_m, style, travel_m, sides)
@@ -98,7 +98,7 @@ def person(
 def walker(
     height_m: float, style: Appearance, travel_m: float, moving: bool, sides: int = 8
 ) -> Mesh:
-    """Somebody on foot; the lower shoe stands on the ground."""
+    """A person on foot; the lower shoe stands on the ground."""
     s = height_m / 1.7
     child = height_m < CHILD_MAX_HEIGHT_M
     phase = 2 * math.pi * (travel_m / (_STRIDE_M * s) + style.pace)
@@ -117,9 +117,8 @@ def walker(
         ankle = knee + 0.40 * np.array([math.sin(shin), 0.0, -math.cos(shin)])
         pitch = 0.6 * min(0.0, shin) if moving else 0.0
         heel = ankle + np.array([-0.045, 0, -0.045])
-        toe = ankle + np.array(
-            [0.155 * math.cos(pitch), 0.02 * side, -0.05 + 0.155 * math.sin(pitch)]
-        )
+        foot = (0.155 * math.cos(pitch), 0.02 * side, -0.05 + 0.155 * math.sin(pitch))
+        toe = ankle + np.array(foot)
         low = min(low, float(heel[2]) - 0.042, float(toe[2]) - 0.036)
         legs.append((side, thigh, hip, knee, ankle, heel, toe))
 
@@ -174,29 +173,25 @@ def walker(
         b.limb(at_height(hand), at_height(grip), 0.033 * s, 0.03 * s, style.skin)
         if style.bag is not None and side > 0:
             x, y, z = at_height(grip)
-            b.box(
-                (x - 0.14 * s, y - 0.05 * s, z - 0.28 * s),
-                (x + 0.14 * s, y + 0.05 * s, z),
-                style.bag,
-            )
+            low_corner = (x - 0.14 * s, y - 0.05 * s, z - 0.28 * s)
+            b.box(low_corner, (x + 0.14 * s, y + 0.05 * s, z), style.bag)
     x, _, z = at_height(np.array([lean * 0.6, 0, 1.45]))
-    _head(b, (x, 0.0, z), s * (1.18 if child else 1.0), style)
+    head(b, (x, 0.0, z), s * (1.18 if child else 1.0), style)
     if style.pack is not None:
         z0 = (1.05 + up) * s
         b.box((-0.26 * s, -0.13 * s, z0), (-0.1 * s, 0.13 * s, z0 + 0.36 * s), style.pack)
     return b.build()
 
 
-def _head(b: MeshBuilder, neck: Point, s: float, style: Appearance, helmet: bool = False) -> None:
-    """Neck, face and hair above the point `neck`; 0.25 m high for a grown person (s 1)."""
+def head(b: MeshBuilder, neck: Point, s: float, style: Appearance, helmet: bool = False) -> None:
+    """Neck, face and hair above the point `neck`; 0.25 m high for an adult (`s` 1)."""
     x, y, z = neck
     b.limb((x, y, z - 0.03 * s), (x + 0.01, y, z + 0.06 * s), 0.048 * s, 0.046 * s, style.skin)
     b.ball((x + 0.025 * s, y, z + 0.135 * s), (0.098 * s, 0.078 * s, 0.115 * s), style.skin)
-    cover = style.helmet if helmet and style.helmet is not None else style.hat
     if helmet and style.helmet is not None:
         b.ball((x + 0.005 * s, y, z + 0.175 * s), (0.135 * s, 0.1 * s, 0.085 * s), style.helmet, 1)
-    elif cover is not None:
-        b.ball((x + 0.005 * s, y, z + 0.18 * s), (0.112 * s, 0.092 * s, 0.075 * s), cover, 1)
+    elif style.hat is not None:
+        b.ball((x + 0.005 * s, y, z + 0.18 * s), (0.112 * s, 0.092 * s, 0.075 * s), style.hat, 1)
     else:
         b.ball((x - 0.005 * s, y, z + 0.165 * s), (0.105 * s, 0.09 * s, 0.088 * s), style.hair)
     if style.long_hair:
@@ -206,15 +201,8 @@ def _head(b: MeshBuilder, neck: Point, s: float, style: Appearance, helmet: bool
         )  # fmt: skip
 
 
-def head(b: MeshBuilder, neck: Point, s: float, style: Appearance) -> None:
-    """A head with the helmet that its owner may wear."""
-    _head(b, neck, s, style, helmet=True)
-
-
-def _wheelchair(
-    size_m: tuple[float, float, float], style: Appearance, travel_m: float, sides: int
-) -> Mesh:
-    """A wheelchair and who sits in it, 1.1 x 0.65 x 1.3 m, stretched to `size_m`."""
+def _wheelchair(size_m: Size, style: Appearance, travel_m: float, sides: int) -> Mesh:
+    """A wheelchair and its user, 1.1 x 0.65 x 1.3 m, stretched to `size_m`."""
     b = MeshBuilder(sides)
     frame: Rgb = (54, 58, 66) if style.girth < 1 else (120, 40, 44)
     turned = travel_m / 0.3
@@ -228,16 +216,10 @@ def _wheelchair(
         b.limb((-0.25, 0.21 * side, 0.45), (-0.34, 0.21 * side, 0.98), 0.014, 0.014, frame)
         b.limb((-0.34, 0.21 * side, 0.98), (-0.44, 0.21 * side, 0.96), 0.016, 0.018, RUBBER)
         b.limb((0.25, 0.2 * side, 0.48), (0.42, 0.14 * side, 0.14), 0.014, 0.014, frame)
-        b.box(
-            (0.38, min(0.03 * side, 0.19 * side), 0.1),
-            (0.55, max(0.03 * side, 0.19 * side), 0.12),
-            frame,
-        )
-        hip, knee, ankle = (
-            (-0.12, 0.09 * side, 0.56),
-            (0.3, 0.11 * side, 0.58),
-            (0.4, 0.11 * side, 0.2),
-        )
+        inner, outer = sorted((0.03 * side, 0.19 * side))
+        b.box((0.38, inner, 0.1), (0.55, outer, 0.12), frame)
+        hip, knee = (-0.12, 0.09 * side, 0.56), (0.3, 0.11 * side, 0.58)
+        ankle = (0.4, 0.11 * side, 0.2)
         b.limb(hip, knee, 0.085, 0.065, style.legs)
         b.limb(knee, ankle, 0.06, 0.045, style.legs)
         b.limb(ankle, (0.51, 0.11 * side, 0.155), 0.042, 0.036, style.shoes)
@@ -254,6 +236,6 @@ def _wheelchair(
         [[0.16, 0.12], [0.155, 0.115], [0.17, 0.12], [0.175, 0.105], [0.13, 0.08], [0.05, 0.05]],
         style.top,
     )
-    _head(b, (-0.18, 0.0, 1.07), 0.92, style)
+    head(b, (-0.18, 0.0, 1.07), 0.92, style)
     stretch = (size_m[0] / 1.1, size_m[1] / 0.65, size_m[2] / 1.31)
     return b.build().placed((0.0, 0.0), 0.0, stretch)

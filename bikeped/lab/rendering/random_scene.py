@@ -1,4 +1,4 @@
-"""Scenarios drawn at random, for training: who could stand or pass before the camera."""
+"""Random scenarios and cameras, for training."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ _NEAREST_M, _FARTHEST_M = 1.5, 40.0
 
 @dataclass(frozen=True)
 class SceneMix:
-    """How much there is of what is rare and hard to tell, in random scenarios and streets."""
+    """Shares of rare and difficult road users and fixtures in random scenarios and streets."""
 
     scooters: float = 0.25  #: share of e-scooters among the cyclists
     wheelchairs: float = 0.1  #: share of wheelchair users among the pedestrians
-    beside: float = 0.25  #: share of the pedestrians who stand close to somebody
-    clutter: int = 0  #: a street has up to this many more bollards, bins and signs near the camera
+    beside: float = 0.25  #: share of the pedestrians close to another road user
+    clutter: int = 0  #: up to this many more bollards, bins, signs and hydrants near the camera
 
 
 DEFAULT_MIX = SceneMix()
 
 
 def random_scenario(seed: int, mix: SceneMix = DEFAULT_MIX) -> Scenario:
-    """A scenario of 6 s: walkers, children, wheelchairs, cyclists, e-scooters and vehicles, none to
-    a crowd, 1.5 to 40 m before the usual camera, in all directions, some standing still.
+    """A scenario of 6 s: walkers, children, wheelchairs, cyclists, e-scooters and vehicles, from
+    one to a crowd, 1.5 to 40 m from the default camera, in all directions, some standing still.
     """
     rng = np.random.default_rng((seed, 41))
     busy = float(rng.choice([0.3, 1.0, 1.8]))
@@ -46,7 +46,7 @@ def random_scenario(seed: int, mix: SceneMix = DEFAULT_MIX) -> Scenario:
     def add(kind: str, size: tuple[float, float, float], speed: float, spread: float = 0.0) -> None:
         for _ in range(12):
             x, y = _spot(rng, kind)
-            if spread and taken:  # beside somebody already there
+            if spread and taken:  # close to a road user already placed
                 tx, ty, _ = taken[int(rng.integers(len(taken)))]
                 x, y = tx + float(rng.normal(0, spread)), ty + float(rng.normal(0, spread))
             room = max(size[0], size[1]) / 2 + 0.25
@@ -56,10 +56,8 @@ def random_scenario(seed: int, mix: SceneMix = DEFAULT_MIX) -> Scenario:
             return
         taken.append((x, y, room - 0.25))
         heading = _heading(rng, kind)
-        # The middle of the clip finds the agent at its spot; still ones turn their own way.
-        step = speed * _DURATION_S / 2
-        if speed < 0.05:
-            step = 0.01
+        # The agent is at its spot in the middle of the clip; a still one needs a path, too.
+        step = speed * _DURATION_S / 2 if speed >= 0.05 else 0.01
         dx, dy = math.cos(heading) * step, math.sin(heading) * step
         path = np.array([[0.0, x - dx, y - dy], [_DURATION_S, x + dx, y + dy]])
         agents.append(Agent(len(agents) + 1, kind, path, size))
@@ -92,7 +90,7 @@ def random_scenario(seed: int, mix: SceneMix = DEFAULT_MIX) -> Scenario:
 
 
 def _spot(rng: np.random.Generator, kind: str) -> tuple[float, float]:
-    """A ground position before the usual camera; near ones as often as far ones."""
+    """A ground position in front of the default camera, log-uniform in distance."""
     nearest = _NEAREST_M if kind == "pedestrian" else 2.5
     if kind in {"car", "bus", "truck"}:
         nearest = 6.0
@@ -117,7 +115,7 @@ def _heading(rng: np.random.Generator, kind: str) -> float:
 def random_camera(
     seed: int, size: tuple[int, int] = (960, 540), lens: str = "fisheye"
 ) -> SceneCamera:
-    """A camera for training at the usual place: its lens, height and pitch vary.
+    """A camera for training near the default place, of random lens, height and pitch.
 
     `lens`: `fisheye` (field of view 150 to 205 degrees, four projections, the circle cut off above
     and below as on the usual sensor) or `rectilinear` (55 to 100 degrees wide).
@@ -130,13 +128,8 @@ def random_camera(
         DEFAULT_POSE.heading_deg + float(rng.uniform(-12, 12)),
     )
     if lens == "rectilinear":
-        return rectilinear_camera(
-            float(rng.uniform(55, 100)),
-            size,
-            height_m=height_m,
-            pitch_deg=float(rng.uniform(-24, -6)),
-            pose=pose,
-        )
+        fov, pitch = float(rng.uniform(55, 100)), float(rng.uniform(-24, -6))
+        return rectilinear_camera(fov, size, height_m=height_m, pitch_deg=pitch, pose=pose)
     if lens != "fisheye":
         raise GeometryError(f"lens: {lens!r} is not fisheye or rectilinear")
     fov = float(rng.uniform(150, 205))
@@ -144,6 +137,5 @@ def random_camera(
     circle = size[0] * float(rng.uniform(0.42, 0.52))
     name = str(rng.choice(names))
     model = Lens.from_circle(name, circle, min(fov, 176.0) if name == "orthographic" else fov)
-    return lens_camera(
-        model, size, height_m=height_m, pitch_deg=float(rng.uniform(-25, 4)), pose=pose
-    )
+    pitch = float(rng.uniform(-25, 4))
+    return lens_camera(model, size, height_m=height_m, pitch_deg=pitch, pose=pose)

@@ -1,4 +1,4 @@
-"""The camera that draws: the very lens, framing and pose that later put boxes on the ground.
+"""The camera that draws: the lens, framing and pose that the device maps boxes to the ground with.
 
 Pixels of a picture are measured from its edges: the middle of the first pixel is at (0.5, 0.5),
 as boxes and `Framing` have it.

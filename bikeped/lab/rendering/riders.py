@@ -1,10 +1,10 @@
-"""Cyclists, riders of e-scooters and of motorcycles."""
+"""Cyclists and riders of e-scooters and motorcycles."""
 
 from __future__ import annotations
 
 import math
 
-from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Point, Rgb
+from bikeped.lab.rendering.mesh import Mesh, MeshBuilder, Point, Rgb, Size
 from bikeped.lab.rendering.people import RUBBER, Appearance, head
 
 #: A cyclist agent shorter than this stands on an e-scooter.
@@ -20,7 +20,7 @@ _TAIL: Rgb = (230, 30, 26)
 
 def rider(
     kind: str,
-    size_m: tuple[float, float, float],
+    size_m: Size,
     style: Appearance,
     paint: int,
     travel_m: float,
@@ -34,9 +34,7 @@ def rider(
     return _bicycle(size_m, style, paint, travel_m, sides)
 
 
-def _bicycle(
-    size_m: tuple[float, float, float], style: Appearance, paint: int, travel_m: float, sides: int
-) -> Mesh:
+def _bicycle(size_m: Size, style: Appearance, paint: int, travel_m: float, sides: int) -> Mesh:
     b = MeshBuilder(sides)
     frame = PAINTS[paint % len(PAINTS)]
     sporty = paint % 3 == 0  # bent low over the bars, or upright
@@ -72,43 +70,25 @@ def _bicycle(
     for side in (1.0, -1.0):
         turn = -roll * 0.42 + (0 if side > 0 else math.pi)  # a usual gear
         pedal = (crank[0] + 0.165 * math.cos(turn), crank[2] + 0.165 * math.sin(turn))
-        b.limb(
-            (crank[0], 0.08 * side, crank[2]),
-            (pedal[0], 0.09 * side, pedal[1]),
-            0.012,
-            0.012,
-            (130, 132, 136),
-        )
+        axle = (crank[0], 0.08 * side, crank[2])
+        b.limb(axle, (pedal[0], 0.09 * side, pedal[1]), 0.012, 0.012, (130, 132, 136))
         ankle = (pedal[0] - 0.05, pedal[1] + 0.11)
-        knee = _knee((hip[0], hip[2] - 0.02), ankle, 0.42, 0.41)
+        knee_x, knee_z = _knee((hip[0], hip[2] - 0.02), ankle, 0.42, 0.41)
         y = 0.1 * side
+        thigh, knee = (hip[0], 0.085 * side, hip[2] - 0.02), (knee_x, y * 1.2, knee_z)
         shin = style.legs if style.wear != "shorts" else style.skin
-        b.limb(
-            (hip[0], 0.085 * side, hip[2] - 0.02),
-            (knee[0], y * 1.2, knee[1]),
-            0.088 * g,
-            0.064 * g,
-            style.legs,
-        )
-        b.limb((knee[0], y * 1.2, knee[1]), (ankle[0], y, ankle[1]), 0.06, 0.043, shin)
-        b.limb(
-            (ankle[0] - 0.03, y, ankle[1] - 0.05),
-            (pedal[0] + 0.1, y, pedal[1] + 0.04),
-            0.038,
-            0.032,
-            style.shoes,
-        )
+        b.limb(thigh, knee, 0.088 * g, 0.064 * g, style.legs)
+        b.limb(knee, (ankle[0], y, ankle[1]), 0.06, 0.043, shin)
+        heel, toe = (ankle[0] - 0.03, y, ankle[1] - 0.05), (pedal[0] + 0.1, y, pedal[1] + 0.04)
+        b.limb(heel, toe, 0.038, 0.032, style.shoes)
         shoulder = (chest[0] + 0.02, 0.185 * side * g, chest[2])
         hand = (bar[0], 0.24 * side, bar[2] + 0.03)
-        elbow = (
-            (shoulder[0] + hand[0]) / 2 - 0.04,
-            0.27 * side,
-            (shoulder[2] + hand[2]) / 2 - 0.06,
-        )
+        middle_x, middle_z = (shoulder[0] + hand[0]) / 2, (shoulder[2] + hand[2]) / 2
+        elbow = (middle_x - 0.04, 0.27 * side, middle_z - 0.06)
         _arm(b, shoulder, elbow, hand, style)
     _torso(b, hip, chest, style)
     neck = (chest[0] + 0.07, 0.0, chest[2] + 0.07)
-    head(b, neck, 1.0, style)
+    head(b, neck, 1.0, style, helmet=True)
     top_m = neck[2] + 0.26
     return b.build().placed((0, 0), 0.0, (size_m[0] / 1.76, size_m[1] / 0.6, size_m[2] / top_m))
 
@@ -147,8 +127,8 @@ def _knee(
     return hip[0] + thigh * math.cos(angle), hip[1] + thigh * math.sin(angle)
 
 
-def _scooter(size_m: tuple[float, float, float], style: Appearance, paint: int, sides: int) -> Mesh:
-    """Somebody standing on an e-scooter, 1.2 x 0.5 x 1.75 m."""
+def _scooter(size_m: Size, style: Appearance, paint: int, sides: int) -> Mesh:
+    """A rider standing on an e-scooter, 1.2 x 0.5 x 1.75 m."""
     b = MeshBuilder(sides)
     frame = PAINTS[(paint + 2) % len(PAINTS)]
     for x in (-0.47, 0.47):
@@ -173,21 +153,14 @@ def _scooter(size_m: tuple[float, float, float], style: Appearance, paint: int, 
         b.limb((hip[0], 0.085 * side, 0.96), (knee[0], y * 1.4, knee[1]), 0.085, 0.062, style.legs)
         b.limb((knee[0], y * 1.4, knee[1]), (ankle[0], y, ankle[1]), 0.058, 0.044, shin)
         b.limb((ankle[0] - 0.03, y, 0.2), (ankle[0] + 0.16, y, 0.2), 0.042, 0.036, style.shoes)
-        _arm(
-            b,
-            (chest[0], 0.19 * side, 1.45),
-            (0.1, 0.26 * side, 1.22),
-            (0.33, 0.2 * side, 1.15),
-            style,
-        )
+        elbow, hand = (0.1, 0.26 * side, 1.22), (0.33, 0.2 * side, 1.15)
+        _arm(b, (chest[0], 0.19 * side, 1.45), elbow, hand, style)
     _torso(b, hip, chest, style)
-    head(b, (0.0, 0.0, 1.56), 1.0, style)
+    head(b, (0.0, 0.0, 1.56), 1.0, style, helmet=True)
     return b.build().placed((0, 0), 0.0, (size_m[0] / 1.2, size_m[1] / 0.52, size_m[2] / 1.82))
 
 
-def _motorcycle(
-    size_m: tuple[float, float, float], style: Appearance, paint: int, travel_m: float, sides: int
-) -> Mesh:
+def _motorcycle(size_m: Size, style: Appearance, paint: int, travel_m: float, sides: int) -> Mesh:
     b = MeshBuilder(sides)
     colour = PAINTS[(paint + 1) % len(PAINTS)]
     for x in (-0.72, 0.74):

@@ -1,4 +1,4 @@
-"""A mesh as the camera sees it: colours and coverage of a small part of the picture."""
+"""A mesh as the camera sees it: colour and coverage of a small part of the picture."""
 
 from __future__ import annotations
 
@@ -67,33 +67,22 @@ def rasterise(
         kept, pixels = kept[whole], pixels[whole]
     if len(kept) == 0:
         return None
-    low, high = _extent(pixels)
+    low, high = pixels.min(axis=(0, 1)), pixels.max(axis=(0, 1))
     bounds = _bounds(low, high, view.size)
     if bounds is None:
         return None
-    left, top, right, bottom = bounds
     part = quads[kept]
     sight = 0.25 * (part[:, 0] + part[:, 1] + part[:, 2] + part[:, 3]) - eye
     away = np.einsum("ij,ij->i", sight, sight)
     order = np.lexsort((-away, mesh.layer[kept]))
     colour = shade_faces(mesh, normal, kept, light, local)[order]
     scale = _supersampling(float((high - low).max()))
-    fixed = np.round(
-        ((pixels[order] - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)
-    ).astype(np.int32)
-    canvas: ImageArray = np.zeros(((bottom - top) * scale, (right - left) * scale, 4), np.uint8)
-    fill = cv2.fillConvexPoly
-    for points, (r, g, b) in zip(fixed, colour.tolist(), strict=True):
-        fill(canvas, points, (r, g, b, 255), cv2.LINE_8, _SHIFT)
-    if scale > 1:
-        canvas = np.asarray(
-            cv2.resize(canvas, (right - left, bottom - top), interpolation=cv2.INTER_AREA), np.uint8
-        )
+    canvas = _filled(
+        pixels[order], bounds, scale, np.pad(colour, ((0, 0), (0, 1)), constant_values=255)
+    )
     box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    return Sprite(
-        left, top, np.ascontiguousarray(canvas[..., :3]), np.ascontiguousarray(canvas[..., 3]),
-        box, distance_m,
-    )  # fmt: skip
+    rgb, alpha = np.ascontiguousarray(canvas[..., :3]), np.ascontiguousarray(canvas[..., 3])
+    return Sprite(bounds[0], bounds[1], rgb, alpha, box, distance_m)
 
 
 def shade_faces(
@@ -131,26 +120,35 @@ def shadow(
     pixels = pixels[_finite_faces(pixels)]
     if len(pixels) == 0:
         return None
-    bounds = _bounds(*_extent(pixels), view.size, beyond=0.0)
+    bounds = _bounds(pixels.min(axis=(0, 1)), pixels.max(axis=(0, 1)), view.size, beyond=0.0)
     if bounds is None:
         return None
     left, top, right, bottom = bounds
     scale = 2 if max(right - left, bottom - top) < 160 else 1
-    canvas: ImageArray = np.zeros(((bottom - top) * scale, (right - left) * scale), np.uint8)
-    fixed = np.round(((pixels - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT))
-    faces = fixed.astype(np.int32)
-    for i in range(len(faces)):
-        cv2.fillConvexPoly(canvas, faces[i], 255, cv2.LINE_8, _SHIFT)
-    if scale > 1:
-        canvas = np.asarray(
-            cv2.resize(canvas, (right - left, bottom - top), interpolation=cv2.INTER_AREA), np.uint8
-        )
+    canvas = _filled(pixels, bounds, scale, np.full((len(pixels), 1), 255.0))[..., 0]
     blur = max(softness, 0) * 2 + 1
     out = cv2.GaussianBlur(canvas, (blur, blur), 0) if blur > 1 else canvas
     return left, top, np.asarray(out, np.float32) / np.float32(255)
 
 
-def touch(one: Sprite, other: Sprite) -> bool:
+def _filled(
+    pixels: FloatArray, bounds: tuple[int, int, int, int], scale: int, colour: FloatArray
+) -> ImageArray:
+    """Faces [n, 4, 2] filled with `colour` [n, c] in their order on a canvas [h, w, c] of these
+    bounds; drawn `scale` times as large and averaged."""
+    left, top, right, bottom = bounds
+    size = right - left, bottom - top
+    canvas: ImageArray = np.zeros((size[1] * scale, size[0] * scale, colour.shape[1]), np.uint8)
+    fixed = ((pixels - (left, top)) * scale - 0.5).clip(-1e6, 1e6) * (1 << _SHIFT)
+    points = np.round(fixed).astype(np.int32)
+    for i, value in enumerate(colour.tolist()):
+        cv2.fillConvexPoly(canvas, points[i], value, cv2.LINE_8, _SHIFT)
+    if scale > 1:
+        canvas = np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return canvas.reshape(size[1], size[0], -1)
+
+
+def sprites_overlap(one: Sprite, other: Sprite) -> bool:
     """Whether two sprites' rectangles overlap."""
     (h, w), (k, v) = one.alpha.shape, other.alpha.shape
     return (
@@ -161,7 +159,7 @@ def touch(one: Sprite, other: Sprite) -> bool:
     )
 
 
-def inside(
+def overlapping_slices(
     size: tuple[int, int], left: int, top: int, width: int, height: int
 ) -> tuple[slice, slice, slice, slice] | None:
     """Rows and columns of a picture of `size` and of a patch at this place that overlap."""
@@ -169,23 +167,13 @@ def inside(
     x1, y1 = min(left + width, size[0]), min(top + height, size[1])
     if x1 <= x0 or y1 <= y0:
         return None
-    return (
-        slice(y0, y1),
-        slice(x0, x1),
-        slice(y0 - top, y1 - top),
-        slice(x0 - left, x1 - left),
-    )
+    return slice(y0, y1), slice(x0, x1), slice(y0 - top, y1 - top), slice(x0 - left, x1 - left)
 
 
 def _finite_faces(pixels: FloatArray) -> BoolArray:
     """Which faces [n, 4, 2] have all their corners."""
     flat = pixels.reshape(-1, 8)
     return np.isfinite(flat @ np.ones(8))
-
-
-def _extent(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    u, v = pixels[..., 0], pixels[..., 1]
-    return np.array([u.min(), v.min()]), np.array([u.max(), v.max()])
 
 
 def _bounds(

@@ -1,6 +1,6 @@
-"""Where the street lies and what stands along it: a place by its number. Pure.
+"""Layout of a street and its fixtures, by number. Pure.
 
-The road runs along the world's x axis; place 0 has a crosswalk at x = 5 and a side street to the
+The road runs along the world's x axis; layout 0 has a crosswalk at x = 5 and a side street to the
 west, as the bundled scenarios have it. Widths, markings, colours, houses and furniture vary.
 """
 
@@ -17,8 +17,8 @@ CROSSING_X_M = 5.0
 
 @dataclass(frozen=True)
 class Fixture:
-    """One thing that stands: `what` (lamp, sign, tree, bin, hydrant, signal, bollard, car), where
-    [x, y], which way it faces, and a number for its looks."""
+    """`what` (lamp, sign, tree, bin, hydrant, signal, bollard, car), place [x, y], the direction it
+    faces, and a number for its shape and colours."""
 
     what: str
     xy_m: tuple[float, float]
@@ -41,7 +41,7 @@ class House:
 
 @dataclass(frozen=True)
 class StreetLayout:
-    """Everything that stays. Metres in the world frame."""
+    """Everything static, metres in the world frame."""
 
     number: int
     kerb: float  #: the road reaches from -kerb to kerb
@@ -67,8 +67,16 @@ _WALLS: tuple[Rgb, ...] = (
 )  # fmt: skip
 
 
+_PAVINGS: tuple[Rgb, ...] = (
+    (168.0, 164.0, 156.0), (150.0, 148.0, 146.0), (176.0, 150.0, 130.0), (188.0, 184.0, 176.0),
+)  # fmt: skip
+_VERGES: tuple[Rgb, ...] = (
+    (104.0, 128.0, 74.0), (128.0, 126.0, 92.0), (158.0, 154.0, 148.0), (86.0, 110.0, 64.0),
+)  # fmt: skip
+
+
 def street_layout(number: int, clutter: int = 0) -> StreetLayout:
-    """The place of this number, the same each time, with `clutter` more things near the camera."""
+    """The layout of this number, always the same, with `clutter` more fixtures near the camera."""
     rng = np.random.default_rng((number, 5))
     plain = number == 0
     kerb = 6.1 if plain else float(rng.uniform(4.9, 8.0))
@@ -82,18 +90,8 @@ def street_layout(number: int, clutter: int = 0) -> StreetLayout:
     cross = CROSSING_X_M + (0.0 if plain else float(rng.uniform(-6, 6)))
     grey = float(rng.uniform(-16, 14)) if not plain else 0.0
     asphalt = (98 + grey, 100 + grey, 104 + grey)
-    paving = (
-        (168.0, 164.0, 156.0),
-        (150.0, 148.0, 146.0),
-        (176.0, 150.0, 130.0),
-        (188.0, 184.0, 176.0),
-    )[0 if plain else int(rng.integers(4))]
-    verge = (
-        (104.0, 128.0, 74.0),
-        (128.0, 126.0, 92.0),
-        (158.0, 154.0, 148.0),
-        (86.0, 110.0, 64.0),
-    )[0 if plain else int(rng.integers(4))]
+    paving = _PAVINGS[0 if plain else int(rng.integers(4))]
+    verge = _VERGES[0 if plain else int(rng.integers(4))]
     return StreetLayout(
         number=number,
         kerb=kerb,
@@ -121,9 +119,9 @@ def _houses(
     houses = []
     setback = float(rng.uniform(0.5, 6.0))
     low = float(rng.uniform(4.5, 8.0))
-    for row, start, end in (("north", -95.0, 105.0), ("south", -95.0, 105.0)):
-        x = start
-        while x < end:
+    for row in ("north", "south"):
+        x = -95.0
+        while x < 105.0:
             wide = float(rng.uniform(7, 16))
             tall = low + float(rng.uniform(0, 10))
             gap = 0.0 if rng.random() < 0.7 else float(rng.uniform(2, 6))
@@ -152,7 +150,7 @@ def _fixtures(
     side: tuple[float, float] | None,
     cross: float,
 ) -> tuple[Fixture, ...]:
-    """Lamps, trees, signs, bins and parked cars; more of them in some places than in others."""
+    """Lamps, trees, signs, bins and parked cars."""
     out: list[Fixture] = []
 
     def put(what: str, x: float, y: float, heading: float = 0.0) -> None:
@@ -193,7 +191,7 @@ def _fixtures(
 
 
 def _clutter(number: int, count: int, kerb: float) -> tuple[Fixture, ...]:
-    """Things of a person's size below the default camera, also where no city would put them."""
+    """Fixtures of a person's size near the default camera, also at unlikely spots."""
     rng = np.random.default_rng((number, 97))
     return tuple(
         Fixture(

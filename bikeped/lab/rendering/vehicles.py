@@ -89,7 +89,7 @@ def _car(
                 w = np.array([0.06, 0.012 * side, 0.0])
                 back = w * (-1, 1, 1)
                 pillar = [q + back, q + w, p + w, p + back]
-                b.faces([pillar if side > 0 or side < 0 else pillar[::-1]], paint, layer=1)
+                b.faces([pillar], paint, layer=1)
     for x, end in ((0, 1), (-1, -1)):
         ring = rings[x]
         middle = ring.mean(axis=0)
@@ -112,28 +112,40 @@ def _car(
         b.lamp((-2.26, side * 0.6, 0.78), (230, 30, 26), 0.4)
         mirror = (0.72, side * 0.96, 0.98)
         b.limb(mirror, (0.72, side * 0.9, 0.96), 0.075, 0.05, paint)
-    b.faces(
-        [[(2.25, -0.36, 0.42), (2.25, 0.36, 0.42), (2.25, 0.36, 0.58), (2.25, -0.36, 0.58)]],
-        _DARK,
-        layer=1,
-    )
+    _plate(b, 2.25, (-0.36, 0.36), (0.42, 0.58), _DARK)
     plate = [(-2.23, 0.26, 0.62), (-2.23, -0.26, 0.62), (-2.2, -0.26, 0.74), (-2.2, 0.26, 0.74)]
     b.faces([plate], (225, 225, 215), layer=1)
     return b.build()
 
 
+def _plate(
+    b: MeshBuilder,
+    x: float,
+    y: tuple[float, float],
+    z: tuple[float, float],
+    colour: Rgb,
+    glow: float = 0.0,
+) -> None:
+    """An upright rectangle across the vehicle at `x`, facing away from the vehicle's middle."""
+    (y0, y1), (z0, z1) = y if x > 0 else y[::-1], z
+    b.faces([[(x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1)]], colour, glow, layer=1)
+
+
 def _panels(
-    b: MeshBuilder, x0: float, x1: float, z0: float, z1: float, half: float, colour: Rgb,
-    *, count: int, gap: float, layer: int = 1, glow: float = 0.0,
-) -> None:  # fmt: skip
-    """Windows along both sides."""
+    b: MeshBuilder,
+    x: tuple[float, float],
+    z: tuple[float, float],
+    half: float,
+    count: int,
+    gap: float,
+) -> None:
+    """`count` windows along both sides."""
+    (x0, x1), (z0, z1) = x, z
     step = (x1 - x0) / count
     for i in range(count):
         a, c = x0 + i * step + gap / 2, x0 + (i + 1) * step - gap / 2
-        b.faces([[(c, half, z0), (a, half, z0), (a, half, z1), (c, half, z1)]], colour, glow, layer)
-        b.faces(
-            [[(a, -half, z0), (c, -half, z0), (c, -half, z1), (a, -half, z1)]], colour, glow, layer
-        )
+        for y, (p, q) in ((half, (c, a)), (-half, (a, c))):
+            b.faces([[(p, y, z0), (q, y, z0), (q, y, z1), (p, y, z1)]], _GLASS, layer=1)
 
 
 def _big_wheel(b: MeshBuilder, x: float, half: float, radius: float) -> None:
@@ -151,57 +163,14 @@ def _bus(number: int) -> Mesh:
     ]
     f, w = 6.0, 1.25
     b.box((-f, -w, 0.3), (f, w, 3.0), paint, pieces=12)
-    _panels(b, -5.8, 5.5, 1.15, 2.45, w + 0.005, _GLASS, count=7, gap=0.14)
-    b.faces(
-        [
-            [
-                (f + 0.005, -1.12, 1.0),
-                (f + 0.005, 1.12, 1.0),
-                (f + 0.005, 1.12, 2.45),
-                (f + 0.005, -1.12, 2.45),
-            ]
-        ],
-        _GLASS,
-        layer=1,
-    )
-    b.faces(
-        [
-            [
-                (f + 0.005, -0.9, 2.55),
-                (f + 0.005, 0.9, 2.55),
-                (f + 0.005, 0.9, 2.85),
-                (f + 0.005, -0.9, 2.85),
-            ]
-        ],
-        (240, 180, 60),
-        0.6,
-        layer=1,
-    )
-    b.faces(
-        [
-            [
-                (-f - 0.005, 1.0, 1.5),
-                (-f - 0.005, -1.0, 1.5),
-                (-f - 0.005, -1.0, 2.4),
-                (-f - 0.005, 1.0, 2.4),
-            ]
-        ],
-        _GLASS,
-        layer=1,
-    )
+    _panels(b, (-5.8, 5.5), (1.15, 2.45), w + 0.005, count=7, gap=0.14)
+    _plate(b, f + 0.005, (-1.12, 1.12), (1.0, 2.45), _GLASS)
+    _plate(b, f + 0.005, (-0.9, 0.9), (2.55, 2.85), (240, 180, 60), 0.6)
+    _plate(b, -f - 0.005, (-1.0, 1.0), (1.5, 2.4), _GLASS)
     for x in (4.6, 0.2):  # doors on the right
-        b.faces(
-            [
-                [
-                    (x - 0.6, -w - 0.006, 0.4),
-                    (x + 0.6, -w - 0.006, 0.4),
-                    (x + 0.6, -w - 0.006, 2.45),
-                    (x - 0.6, -w - 0.006, 2.45),
-                ]
-            ],
-            (60, 74, 84),
-            layer=2,
-        )
+        x0, x1, y = x - 0.6, x + 0.6, -w - 0.006
+        door = [(x0, y, 0.4), (x1, y, 0.4), (x1, y, 2.45), (x0, y, 2.45)]
+        b.faces([door], (60, 74, 84), layer=2)
     _ends(b, f, w, 0.6)
     for x in (-3.6, 3.2):
         _big_wheel(b, x, w, 0.48)
@@ -216,17 +185,9 @@ def _truck(number: int) -> Mesh:
     b.box((-3.5, -w, 0.75), (1.55, w, 2.8), load, pieces=6)
     b.box((-3.4, -1.0, 0.45), (1.7, 1.0, 0.75), _DARK, pieces=4)
     b.box((1.7, -1.15, 0.35), (3.5, 1.15, 2.45), cab, pieces=3)
-    b.faces(
-        [[(3.505, -1.02, 1.4), (3.505, 1.02, 1.4), (3.505, 1.02, 2.2), (3.505, -1.02, 2.2)]],
-        _GLASS,
-        layer=1,
-    )
-    _panels(b, 2.1, 3.3, 1.4, 2.15, 1.155, _GLASS, count=1, gap=0.0)
-    b.faces(
-        [[(3.505, -0.7, 0.75), (3.505, 0.7, 0.75), (3.505, 0.7, 1.15), (3.505, -0.7, 1.15)]],
-        _DARK,
-        layer=1,
-    )
+    _plate(b, 3.505, (-1.02, 1.02), (1.4, 2.2), _GLASS)
+    _panels(b, (2.1, 3.3), (1.4, 2.15), 1.155, count=1, gap=0.0)
+    _plate(b, 3.505, (-0.7, 0.7), (0.75, 1.15), _DARK)
     _ends(b, 3.5, 1.1, 0.6)
     for x in (-2.2, 2.55):
         _big_wheel(b, x, 1.2, 0.46)
@@ -234,34 +195,10 @@ def _truck(number: int) -> Mesh:
 
 
 def _ends(b: MeshBuilder, f: float, w: float, z: float) -> None:
-    """Head and tail lamps."""
+    """Head and tail lamps at x = `f` and -`f`, `z` above the ground."""
     for side in (1, -1):
         y0, y1 = sorted((side * w * 0.55, side * w * 0.9))
-        b.faces(
-            [
-                [
-                    (f + 0.008, y0, z),
-                    (f + 0.008, y1, z),
-                    (f + 0.008, y1, z + 0.2),
-                    (f + 0.008, y0, z + 0.2),
-                ]
-            ],
-            _HEAD,
-            0.5,
-            layer=1,
-        )
-        b.faces(
-            [
-                [
-                    (-f - 0.008, y1, z),
-                    (-f - 0.008, y0, z),
-                    (-f - 0.008, y0, z + 0.3),
-                    (-f - 0.008, y1, z + 0.3),
-                ]
-            ],
-            _TAIL,
-            0.35,
-            layer=1,
-        )
+        _plate(b, f + 0.008, (y0, y1), (z, z + 0.2), _HEAD, 0.5)
+        _plate(b, -f - 0.008, (y0, y1), (z, z + 0.3), _TAIL, 0.35)
         b.lamp((f + 0.02, side * w * 0.72, z + 0.1), (255, 248, 225), 1.0)
         b.lamp((-f - 0.02, side * w * 0.72, z + 0.15), (230, 30, 26), 0.4)

@@ -1,4 +1,4 @@
-"""What lies over the whole picture: sensor noise, rain, glare."""
+"""Sensor noise, rain and glare over the whole picture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TILE = 512
 
 
 class Weather:
-    """Applied to every picture in place; what moves in it follows from the time alone."""
+    """Applied to every picture in place; depends on the conditions and the time only."""
 
     def __init__(self, backdrop: Backdrop) -> None:
         self._backdrop = backdrop
@@ -59,13 +59,12 @@ def _tiled(
 
 @lru_cache(maxsize=8)
 def _noise_tiles(deviation: float) -> tuple[ImageArray, ImageArray]:
-    """What noise adds and what it takes away [512, 512, 3]; more in brightness than in colour."""
+    """Positive and negative noise [512, 512, 3], more in brightness than in colour."""
     rng = np.random.default_rng(4711)
     grey = rng.standard_normal((_TILE, _TILE, 1), np.float32)
     colour = rng.standard_normal((_TILE, _TILE, 3), np.float32)
     noise = deviation * (0.8 * grey + 0.6 * colour)
-    plus = np.clip(np.round(noise), 0, 255).astype(np.uint8)
-    minus = np.clip(np.round(-noise), 0, 255).astype(np.uint8)
+    plus, minus = (np.clip(np.round(part), 0, 255).astype(np.uint8) for part in (noise, -noise))
     return plus, minus
 
 
@@ -88,7 +87,7 @@ def _rain_tiles(size: tuple[int, int]) -> ImageArray:
 
 
 def _flare(backdrop: Backdrop) -> ImageArray | None:
-    """The veil and the ghosts of a sun in the picture, or just out of it."""
+    """Veiling glare and ghosts of a sun in or near the picture."""
     view, light = backdrop.view, backdrop.light
     far = view.eye_m + light.to_sun * 1e4
     pixel = view.pixels(far[None])[0]
@@ -100,8 +99,7 @@ def _flare(backdrop: Backdrop) -> ImageArray | None:
     x, y = x * (width / small[0]), y * (height / small[1])
     d = np.hypot(x - pixel[0], y - pixel[1]) / height
     veil = 34 + 190 * np.exp(-((d / 0.10) ** 1.0)) + 90 * np.exp(-d / 0.35)
-    colour = np.array([1.0, 0.95, 0.85], np.float32)
-    out = veil[..., None] * colour
+    out = veil[..., None] * np.array([1.0, 0.95, 0.85], np.float32)
     centre = np.array([width / 2, height / 2])
     for part, radius, tone in (
         (-0.45, 0.035, (60, 90, 60)),
@@ -111,7 +109,7 @@ def _flare(backdrop: Backdrop) -> ImageArray | None:
         at = centre + (pixel - centre) * part
         ring = np.clip(1 - np.hypot(x - at[0], y - at[1]) / (radius * height), 0, 1)
         out += np.minimum(ring * 4, 1)[..., None] * np.array(tone, np.float32) * 0.4
-    big = cv2.resize(np.clip(out * light.glare, 0, 255).astype(np.uint8), (width, height))
-    flare = np.asarray(big, np.uint8)
+    low = np.clip(out * light.glare, 0, 255).astype(np.uint8)
+    flare = np.asarray(cv2.resize(low, (width, height)), np.uint8)
     flare[~backdrop.lit] = 0
     return flare

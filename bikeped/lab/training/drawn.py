@@ -22,7 +22,10 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import DataSetError
 from bikeped.files import make_folder
 from bikeped.geometry import CameraPose
-from bikeped.lab.rendering import DEFAULT_POSE, SceneCamera, SceneMix, scene_camera, write_dataset
+from bikeped.lab.rendering import SceneCamera, scene_camera
+from bikeped.lab.rendering.dataset import write_dataset
+from bikeped.lab.rendering.random_scene import SceneMix
+from bikeped.lab.rendering.render_camera import DEFAULT_POSE
 from bikeped.lab.training.coco import write_annotations
 
 #: Seeds of parts begin here, so that no set shares a street with another: training from

@@ -23,8 +23,9 @@ from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import Detector, load_detector
 from bikeped.geometry import road_region
 from bikeped.geometry.boxes import iou_matrix
-from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, pictures, scene_camera
+from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, scene_camera
 from bikeped.lab.rendering.clip import encode_jpeg
+from bikeped.lab.rendering.dataset import pictures
 from bikeped.types import Detections, FloatArray, Kind, Region
 
 #: Bounds of the distance rings, metres along the ground from below the lens.

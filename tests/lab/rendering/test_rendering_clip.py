@@ -19,8 +19,8 @@ from bikeped.lab.rendering import (
     scene_camera,
     sidecar_path,
     write_clip,
-    write_dataset,
 )
+from bikeped.lab.rendering.dataset import write_dataset
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.types import Kind
 

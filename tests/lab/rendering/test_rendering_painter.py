@@ -12,22 +12,12 @@ import pytest
 from bikeped.config import load_config
 from bikeped.errors import GeometryError, ScenarioError
 from bikeped.geometry import Lens
-from bikeped.lab.rendering import (
-    LIGHTS,
-    Conditions,
-    SceneCamera,
-    SceneMix,
-    ScenePainter,
-    lens_camera,
-    random_camera,
-    random_conditions,
-    random_scenario,
-    rectilinear_camera,
-    scene_camera,
-)
+from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter, scene_camera
 from bikeped.lab.rendering.backdrop import backdrop
 from bikeped.lab.rendering.compositing import paste_sprite
-from bikeped.lab.rendering.render_camera import rays
+from bikeped.lab.rendering.conditions import LIGHTS, random_conditions
+from bikeped.lab.rendering.random_scene import SceneMix, random_camera, random_scenario
+from bikeped.lab.rendering.render_camera import lens_camera, rays, rectilinear_camera
 from bikeped.lab.rendering.sprite import Sprite
 from bikeped.lab.rendering.street_layout import street_layout
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenario

@@ -8,7 +8,7 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.errors import DataSetError
-from bikeped.lab.rendering import DEFAULT_POSE
+from bikeped.lab.rendering.render_camera import DEFAULT_POSE
 from bikeped.lab.training.coco import read_coco, read_picture
 from bikeped.lab.training.drawn import DrawnSettings, draw_set, part_camera
 
