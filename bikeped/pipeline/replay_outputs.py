@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bikeped.decision.episodes import EpisodeTracker
 from bikeped.overlay import OverlayData, VideoWriter, compose, ground_projector
 from bikeped.pipeline.loop import FrameResult
 from bikeped.pipeline.telemetry import event_line_for
@@ -33,7 +34,7 @@ class ReplaySummary:
     not_on_ground: int = 0
     alerts: list[dict[str, Any]] = field(default_factory=list)
     duration_s: float = 0.0
-    _alerting: bool = False
+    _episodes: EpisodeTracker = field(default_factory=EpisodeTracker)
 
     async def on_frame_result(self, result: FrameResult) -> None:
         frame, tracking = result.picture.frame, result.tracking
@@ -44,19 +45,18 @@ class ReplaySummary:
         self.states[decision.state.name] = self.states.get(decision.state.name, 0) + 1
         for key, kind in zip(tracking.tracks.id.tolist(), tracking.tracks.kind, strict=True):
             self.tracks.setdefault(Kind(kind).label, set()).add(key)
-        alerting = decision.state is State.ALERT
-        if alerting and not self._alerting:
+        change = self._episodes.update(decision.state is State.ALERT)
+        if change == "begins":
             self.alerts.append(
                 {
                     "t": round(result.t_s, 3),
                     "frame": frame.number,
                     "sentence": decision.sentence,
-                    "frames": 0,
+                    "frames": 1,
                 }
             )
-        if alerting:
+        elif change == "lasts":
             self.alerts[-1]["frames"] += 1
-        self._alerting = alerting
 
 
 class EventFile:

@@ -12,6 +12,7 @@ import msgspec
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig
+from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.track_and_decide import TrackAndDecide
@@ -56,7 +57,7 @@ class Telemetry:
         self._mqtt, self._audit, self._metrics = publisher, audit, metrics
         self._wall, self._clock = wall_clock, clock
         self.times = StageTimes(remember)
-        self.alerts = 0
+        self._alerts = EpisodeTracker()
         self._shown: tuple[str, tuple[Fault, ...]] | None = None
         self._next_tracks_s = -math.inf
         self._started_s = clock()
@@ -90,15 +91,12 @@ class Telemetry:
 
     def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
         self._signal = signal
+        self._alerts.update(signal.name == "ALERT")
         if self._metrics is not None:
             self._metrics.set_state(_shown(signal))
         shown = (signal.name, signal.faults if signal.name == "FAULT" else ())
         before, self._shown = self._shown, shown
-        if shown == before:
-            return
-        if signal.name == "ALERT":
-            self.alerts += 1
-        if self._mqtt is None:
+        if shown == before or self._mqtt is None:
             return
         message = state_message(
             decision or Decision(0.0, State.IDLE, sentence),
@@ -150,7 +148,7 @@ class Telemetry:
             undecodable=counts.undecodable,
             failed=counts.failed,
             out_of_order=counts.out_of_order,
-            alerts=self.alerts,
+            alerts=self._alerts.count,
             mqtt_dropped=self._mqtt.status.dropped if self._mqtt else 0,
             audit_dropped=self._audit.dropped if self._audit else 0,
         )

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 import msgspec
 import numpy as np
 
+from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import fault_texts
 from bikeped.pipeline.loop import FrameResult
 from bikeped.telemetry.latency import STAGES
@@ -100,6 +101,7 @@ class LiveState:
         self.number = 0  #: grows with every piece of news
         self.frames = 0  #: grows with every frame
         self.alerts: deque[AlertRecord] = deque(maxlen=ALERTS)
+        self._episodes = EpisodeTracker()
         self.alerts_number = 0  #: grows whenever `alerts` changes
         self.trend: deque[TrendPoint] = deque(maxlen=TREND_S)
         self.closed = False
@@ -170,15 +172,9 @@ class LiveState:
 
     def _follow_alert(self, result: FrameResult) -> None:
         decision = result.tracking.decision
-        last = self.alerts[-1] if self.alerts else None
-        going_on = last is not None and last.ended_unix_s is None
-        if decision.state is not State.ALERT:
-            if last is not None and going_on:
-                last.ended_unix_s = self._wall()
-                self.alerts_number += 1
-            return
         pair = _pair(decision.pair)
-        if last is None or not going_on:
+        change = self._episodes.update(decision.state is State.ALERT)
+        if change == "begins":
             self.alerts.append(
                 AlertRecord(
                     started_unix_s=self._wall(),
@@ -189,11 +185,15 @@ class LiveState:
                     frames=1,
                 )
             )
+        elif change == "ends":
+            self.alerts[-1].ended_unix_s = self._wall()
+        elif change == "lasts":
+            last = self.alerts[-1]
+            last.frames += 1
+            if pair is not None and (last.nearest_m is None or pair.distance_m < last.nearest_m):
+                last.nearest_m = pair.distance_m
+        if change in ("begins", "ends"):
             self.alerts_number += 1
-            return
-        last.frames += 1
-        if pair is not None and (last.nearest_m is None or pair.distance_m < last.nearest_m):
-            last.nearest_m = pair.distance_m
 
     def _count_latency(self, result: FrameResult) -> None:
         wall_s = self._wall()

@@ -18,7 +18,7 @@ from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.telemetry import Telemetry
 from bikeped.telemetry.builders import encode
 from bikeped.telemetry.metrics import Metrics
-from bikeped.types import Kind
+from bikeped.types import Colour, Kind, Signal
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
 
@@ -105,7 +105,7 @@ async def test_the_state_message_of_an_alert_has_that_frames_pair():
         line = rig.audit.lines[-1]
         assert alert["state"] == line.state == "ALERT"
         assert alert["pair"] == list(line.pair)
-        assert rig.telemetry.alerts == 1
+        assert rig.telemetry.health(rig.loop, "simulated").counters.alerts == 1
         for _ in range(2):
             rig.telemetry.measure(rig.loop)
         assert rig.metrics.registry.get_sample_value("bikeped_alerts_total") == 1
@@ -251,3 +251,10 @@ def test_the_announcer_refreshes_what_it_shows():
     dispatcher.off()
     dispatcher.refresh()
     assert [signal.name for signal in light.shown] == ["OFF", "OFF"]
+
+
+async def test_every_change_into_alert_counts_once():
+    async with TelemetryRig() as rig:
+        for name in ("SAFE", "ALERT", "ALERT", "WARNING", "ALERT", "FAULT"):
+            rig.telemetry.on_signal(Signal(name, Colour.OFF), name, None)
+        assert rig.telemetry.health(rig.loop, "simulated").counters.alerts == 2

@@ -16,6 +16,7 @@ import numpy as np
 
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.decision.episodes import onsets
 from bikeped.errors import ScenarioError
 from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
 from bikeped.lab.scenarios.scenario import SIZES_M
@@ -23,7 +24,7 @@ from bikeped.lab.simulation.metrics import Metrics, finite_or_none, measure
 from bikeped.lab.simulation.perception import error_table, localise
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, camera_json, compare, compare_json
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruthSettings
-from bikeped.types import BoolArray, State
+from bikeped.types import State
 
 ProgressCallback = Callable[[int], None]
 
@@ -336,11 +337,6 @@ def warning_budgets(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
         f"distracted {PEDESTRIAN_PRT_S} s, attentive {ATTENTIVE_PRT_S} s; by the worst onset",
     )
     return ExperimentResult("budgets", {"rows": rows}, (table,))
-
-
-def onsets(alert: BoolArray) -> BoolArray:
-    """Frames [f] of one scenario in which ALERT begins."""
-    return np.asarray(alert & ~np.concatenate([[False], alert[:-1]]))
 
 
 def budget_class(budget_s: float | None) -> str:

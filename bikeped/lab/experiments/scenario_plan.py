@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.config import DecisionConfig
-from bikeped.lab.experiments.strip_chart import onsets
+from bikeped.decision.episodes import onsets
 from bikeped.lab.plotting import (
     BLACK,
     BLUE,
@@ -24,7 +24,7 @@ from bikeped.lab.plotting import (
 )
 from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.lab.simulation.suite import Suite
-from bikeped.types import FloatArray
+from bikeped.types import FloatArray, State
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -207,7 +207,7 @@ def _alerts(axes: Axes, suite: Suite, decision: DecisionConfig, index: int) -> N
     scenario, truth = suite.scenarios[index], suite.truths[index]
     agents = {a.id: a for a in scenario.agents}
     state = suite.states(decision)[suite.rule_input.frame_slice(index)]
-    for frame in np.nonzero(onsets(state))[0]:
+    for frame in np.nonzero(onsets(state == State.ALERT))[0]:
         pair = (int(truth.cyclist[frame]), int(truth.pedestrian[frame]))
         found = [agents[i].at(float(truth.time_s[frame])) for i in pair if i in agents]
         points = [place[0] for place in found if place is not None]

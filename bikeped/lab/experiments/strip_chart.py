@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
+from bikeped.decision.episodes import onsets, runs
 from bikeped.lab.plotting import (
     BLACK,
     BLUE,
@@ -61,7 +62,7 @@ def draw_strip(suite: Suite, decision: DecisionConfig, index: int, folder: Path)
         gridspec_kw={"height_ratios": [6, 1]},
     ) as sheet:
         main, band = sheet.axes
-        onset = onsets(state)
+        onset = onsets(state == State.ALERT)
         _shade(main, truth)
         _distances(main, suite, decision, index)
         _moments(main, truth, onset)
@@ -72,18 +73,10 @@ def draw_strip(suite: Suite, decision: DecisionConfig, index: int, folder: Path)
         return sheet.save(folder, f"{file_stem(scenario.name)}-strip")
 
 
-def onsets(state: np.ndarray[Any, np.dtype[np.int8]]) -> BoolArray:
-    """Frames in which ALERT begins."""
-    alert = state == int(State.ALERT)
-    return np.asarray(alert & ~np.concatenate([[False], alert[:-1]]))
-
-
 def spans(mask: BoolArray, time_s: FloatArray) -> list[tuple[float, float]]:
     """From and to of the runs of true frames, each frame lasting 1/30 s."""
-    edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
-    begin, end = np.nonzero(edges == 1)[0], np.nonzero(edges == -1)[0]
     return [
-        (float(time_s[a]), float(time_s[b - 1]) + 1 / 30) for a, b in zip(begin, end, strict=True)
+        (float(time_s[a]), float(time_s[b - 1]) + 1 / 30) for a, b in runs(mask).tolist() if mask[a]
     ]
 
 

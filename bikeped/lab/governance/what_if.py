@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from bikeped.config import DecisionConfig
 from bikeped.config.provenance import decision_hash
+from bikeped.decision.episodes import runs
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.lab.governance.gates import all_hold, check_gates
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
@@ -214,8 +215,6 @@ def _spans(
 ) -> list[dict[str, Any]]:
     """Runs of frames with the same change: from, to (s, both inclusive), state before and after."""
     code = np.where(differs, before.astype(np.int64) * 8 + after, -1)
-    edges = np.nonzero(np.diff(code, prepend=-2))[0]
-    ends = [*edges[1:], len(code)]
     return [
         {
             "from_s": finite_or_none(round(float(time_s[a]), 4)),
@@ -223,7 +222,7 @@ def _spans(
             "before": State(int(before[a])).name,
             "after": State(int(after[a])).name,
         }
-        for a, b in zip(edges, ends, strict=True)
+        for a, b in runs(code).tolist()
         if code[a] >= 0
     ]
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bikeped.decision.episodes import onsets
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.types import BoolArray, FloatArray, IntArray, State
@@ -150,16 +151,14 @@ def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
     sev_fn = _ratio(per(missed, truth.severity), weight)
     sev_fn = np.where((tp + fn > 0) & np.isnan(sev_fn), 0.0, sev_fn)  # actionable at speed 0
     fatigue = per(alert) / frames
-    first = np.zeros(len(alert), np.bool_)
-    first[truth.start] = True
-    onset = alert & (first | ~np.concatenate([[False], alert[:-1]]))
+    onset = onsets(alert, truth.start)
     counted = onset & np.isfinite(truth.budget_s)
     budgets = truth.budget_s[counted]
-    onsets = per(counted)
-    mean_budget = _ratio(per(counted, truth.budget_s), onsets)
+    budget_count = per(counted)
+    mean_budget = _ratio(per(counted, truth.budget_s), budget_count)
     min_budget: FloatArray = np.full(n, np.inf)
     np.minimum.at(min_budget, scenario[counted], budgets)
-    min_budget = np.where(onsets > 0, min_budget, np.nan)
+    min_budget = np.where(budget_count > 0, min_budget, np.nan)
     latency = _alert_latency(truth, alert)
     first_alert = np.full(n, np.inf)
     np.minimum.at(first_alert, scenario[alert], truth.time_s[alert])

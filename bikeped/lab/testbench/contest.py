@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
+from bikeped.decision.episodes import runs
 from bikeped.lab.governance.gates import check_gates
 from bikeped.lab.governance.what_if import Comparison, Variant, compare_variants
 from bikeped.lab.testbench.run import BenchRunner
@@ -161,19 +161,16 @@ def _strip(found: Comparison, name: str) -> dict[str, Any]:
         "name": name,
         "hazard": found.after.suite.scenarios[index].hazard,
         "frames": len(truth.time_s),
-        "truth": runs(truth.danger.astype(int) + truth.imminent),
+        "truth": encode_runs(truth.danger.astype(int) + truth.imminent),
         "before": _states(found.before, name),
         "after": _states(found.after, name),
     }
 
 
 def _states(side: Variant, name: str) -> list[list[int]] | None:
-    return runs(side.states[side.part(name)]) if name in side.suite.names else None
+    return encode_runs(side.states[side.part(name)]) if name in side.suite.names else None
 
 
-def runs(codes: Any) -> list[list[int]]:
+def encode_runs(codes: Any) -> list[list[int]]:
     """[[code, frames], ...] of equal neighbours."""
-    codes = np.asarray(codes)
-    edges = np.nonzero(np.diff(codes, prepend=codes[0] - 1))[0]
-    ends = [*edges[1:].tolist(), len(codes)]
-    return [[int(codes[a]), b - a] for a, b in zip(edges.tolist(), ends, strict=True)]
+    return [[int(codes[a]), b - a] for a, b in runs(codes).tolist()]

@@ -31,7 +31,7 @@ from bikeped.lab.experiments.report import (
 )
 from bikeped.lab.result_tables import ExperimentResult
 from bikeped.lab.scenarios.scenario import Scenario
-from bikeped.lab.testbench.contest import runs
+from bikeped.lab.testbench.contest import encode_runs
 from bikeped.lab.testbench.pages import configurations
 from bikeped.lab.testbench.playback import coverage, playback
 from bikeped.lab.testbench.run import BenchRunner, BenchSuite
@@ -101,11 +101,11 @@ def _play(
     for side in play["sides"][1:]:
         for key in ("sentence", "chosen", "pairs", "pedestrians", "since_cyclist_s", "remembered"):
             del side[key]
-        side["state"] = runs(side["state"])
+        side["state"] = encode_runs(side["state"])
     for agent in play["agents"]:
         for key in ("true", "detected", "heading"):
             agent[key] = _round(agent[key])
-        agent["missed"] = runs(agent["missed"])
+        agent["missed"] = encode_runs(agent["missed"])
     play["tracks"]["xy"] = _round(play["tracks"]["xy"])
     del play["truth"]["severity"]
     return play
@@ -120,9 +120,9 @@ def _strip(suite: BenchSuite, index: int, play: Mapping[str, Any]) -> dict[str, 
         "name": suite.scenarios[index].name,
         "hazard": suite.scenarios[index].hazard,
         "frames": play["frames"],
-        "truth": runs(play["truth"]["tier"]),
+        "truth": encode_runs(play["truth"]["tier"]),
         "before": None,
-        "after": runs(play["sides"][0]["state"]),
+        "after": encode_runs(play["sides"][0]["state"]),
     }
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.decision import PairChecks, explain, is_remembered, pair_metrics, select_pair
+from bikeped.decision.episodes import onsets
 from bikeped.geometry import CameraPose, GroundCamera
-from bikeped.lab.experiments.deterministic import onsets
 from bikeped.lab.simulation.metrics import finite_or_none, measure
 from bikeped.lab.simulation.simulate import FPS, verdicts
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruth

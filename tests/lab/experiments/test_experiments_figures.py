@@ -12,7 +12,7 @@ from bikeped.errors import BikepedError
 from bikeped.lab.cli import conformance_governance as governance
 from bikeped.lab.experiments.figures import FIGURES, draw_all
 from bikeped.lab.experiments.scenario_plan import draw_plan
-from bikeped.lab.experiments.strip_chart import draw_strip, onsets, spans
+from bikeped.lab.experiments.strip_chart import draw_strip, spans
 from bikeped.lab.plotting import FigureSheet, file_stem
 from bikeped.lab.scenarios.scenario import parse_scenario
 from bikeped.lab.simulation.suite import Suite
@@ -162,9 +162,8 @@ def test_a_name_cannot_leave_the_folder():
     assert file_stem("\u00fc") == "scenario"
 
 
-def test_spans_and_onsets():
+def test_spans():
     state = np.array([3, 3, 0, 2, 3, 3], np.int8)
-    assert onsets(state).tolist() == [True, False, False, False, True, False]
     time_s = np.arange(6) / 30
     found = spans(state == 3, time_s)
     assert np.allclose(found, [(0, 2 / 30), (4 / 30, 6 / 30)])
