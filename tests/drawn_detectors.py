@@ -10,7 +10,7 @@ import numpy as np
 from bikeped.detection.base import DetectionResult
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.rendering.clip import read_sidecar
-from bikeped.pipeline.detection_stage import Picture
+from bikeped.pipeline.detection_stage import DecodedFrame
 from bikeped.types import Detections
 
 
@@ -27,7 +27,7 @@ class OracleDetector:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return min(width, 640), min(height, 640)
 
-    def detect(self, picture: Picture) -> DetectionResult:
+    def detect(self, picture: DecodedFrame) -> DetectionResult:
         return DetectionResult(self._of(picture.frame.number), 0.0, 0.0, 0.0)
 
 

@@ -11,8 +11,8 @@ from prometheus_client import CollectorRegistry
 
 from bikeped.config import LoadedConfig, parse_config
 from bikeped.faults import Fault
-from bikeped.pipeline.detection_stage import Picture
-from bikeped.pipeline.loop import FrameResult
+from bikeped.pipeline.detection_stage import DecodedFrame
+from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.builders import ComponentStatus, Counters, HealthMessage, health_message
@@ -120,5 +120,5 @@ class Scene:
         )
         tracking = self.track_and_decide.update(detections, 960, 640, captured_s, 0.0)
         latency = {"acquire": 1.0, "inference": 9.0 + n % 3, "total": 12.0, "capture_age": 13.0}
-        seen = Picture(frame, np.zeros((1, 1, 3), np.uint8), 0.0, 1.0, 1.0)
+        seen = DecodedFrame(frame, np.zeros((1, 1, 3), np.uint8), 0.0, 1.0, 1.0)
         return FrameResult(seen, n / 30, detections, tracking, SIGNALS[signal], latency)

@@ -1,7 +1,7 @@
 """What the road user sees and hears: states to signals, lights, the speaker.
 
-`signal` is pure and decides FAULT; `light` drives a device from its own thread; `gpio`, `usb` and
-`SimulatedLight` are devices; `speaker` plays the sounds of `sounds`.
+`signal_logic` is pure and decides FAULT; `light` drives a device from its own thread; `gpio`, `usb`
+and `SimulatedLight` are devices; `speaker` plays the sounds of `sounds`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from bikeped.feedback.gpio import GpioLight, gpio_lamps
 from bikeped.feedback.light import Light, LightDriver, SimulatedLight
-from bikeped.feedback.signal import OFF, SignalLogic, assess, fault_signal
+from bikeped.feedback.signal_logic import OFF, SignalLogic, fault_signal
 from bikeped.feedback.speaker import Speaker
 from bikeped.feedback.usb import UsbLight, relay_lamps
 
@@ -28,7 +28,6 @@ __all__ = [
     "SimulatedLight",
     "Speaker",
     "UsbLight",
-    "assess",
     "check_light",
     "fault_signal",
     "light_driver",

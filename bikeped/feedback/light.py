@@ -18,7 +18,7 @@ from typing import Protocol, TypeVar
 
 from bikeped.errors import FeedbackError
 from bikeped.faults import Fault
-from bikeped.feedback.signal import fault_signal
+from bikeped.feedback.signal_logic import fault_signal
 from bikeped.types import Colour, Signal
 
 _log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""From a frame to detections: decoding, and whatever looks at the picture."""
+"""From a frame to detections: decoding, then a detector."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from bikeped.types import Frame, ImageArray
 
 #: Inferences at once on a recording, where the processor does them: see `load_detector_pool`.
 MAX_INFLIGHT = 2
-#: Pictures in use at once: being decoded, waiting, judged, being drawn, one more, and looked at.
+#: Decoded frames in use at once: being decoded, waiting, processed, drawn, a spare, and detected.
 FRAME_BUFFERS = 5 + MAX_INFLIGHT
 
 
 @dataclass(frozen=True)
-class Picture:
+class DecodedFrame:
     """A decoded frame; `rgb` may be a scaled copy and is valid for the next `FRAME_BUFFERS` - 1."""
 
     frame: Frame
@@ -29,29 +29,28 @@ class Picture:
 
 
 class FrameDetector(Protocol):
-    """What looks at pictures: a model, or the demo's reader of drawn boxes."""
+    """What finds road users in a frame: a model, or the demo's reader of drawn boxes."""
 
     name: str
     model_hash: str | None
-    cyclist_box_includes_rider: bool  #: whether a cyclist's box holds the rider, too
+    cyclist_box_includes_rider: bool
 
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
-        """Least picture size that it needs of a frame of this size."""
+        """Smallest width and height that it needs of a frame of this size, in pixels."""
 
-    def detect(self, picture: Picture) -> DetectionResult:
-        """What is in the picture; raises DetectorError. Called in worker threads, as many as looks
-        are allowed at once (see `Loop`)."""
+    def detect(self, decoded: DecodedFrame) -> DetectionResult:
+        """What is in the frame; raises DetectorError. Called in up to `max_inflight` threads."""
 
 
 class DetectorPool:
-    """A detector model, in as many copies as pictures are looked at once."""
+    """A detector model, in as many copies as frames are detected at once."""
 
     def __init__(self, *detectors: Detector) -> None:
         first = detectors[0]
         self.name = first.name
         self.model_hash: str | None = first.model_hash
         self.cyclist_box_includes_rider = first.cyclist_box_includes_rider
-        self.at_once = len(detectors)
+        self.max_inflight = len(detectors)
         self._decode_size = first.decode_size
         self._free: queue.SimpleQueue[Detector] = queue.SimpleQueue()
         for detector in detectors:
@@ -60,39 +59,38 @@ class DetectorPool:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return self._decode_size(width, height)
 
-    def detect(self, picture: Picture) -> DetectionResult:
+    def detect(self, decoded: DecodedFrame) -> DetectionResult:
         detector = self._free.get()
         try:
-            return detector.infer(picture.rgb, picture.frame.width, picture.frame.height)
+            return detector.infer(decoded.rgb, decoded.frame.width, decoded.frame.height)
         finally:
             self._free.put(detector)
 
 
 class DetectionStage:
-    """An detector, and the decoding at the smallest scale that it (and a picture for people) needs.
+    """Decodes at the smallest scale that the detector needs, and detects.
 
-    `decode` belongs to one thread and `see` to others, one if its detector does not say more.
+    `view_width`: pixels that a picture for people needs. `decode` belongs to one thread, `detect`
+    to one or more others.
     """
 
     def __init__(self, detector: FrameDetector, view_width: int = 0) -> None:
-        self.detector = detector
+        self.detect = detector.detect
+        self._decode_size = detector.decode_size
         self._view_width = view_width
         self._jpeg = JpegDecoder(buffers=FRAME_BUFFERS)
 
-    def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> Picture:
-        """The picture of a frame; raises CaptureError when it does not decode."""
+    def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> DecodedFrame:
+        """The decoded frame; raises CaptureError when it does not decode."""
         began = time.perf_counter()
         if frame.rgb is not None:
             rgb = frame.rgb
         else:
             assert frame.jpeg is not None  # noqa: S101  Frame holds one of the two
-            width, height = self.detector.decode_size(frame.width, frame.height)
+            width, height = self._decode_size(frame.width, frame.height)
             view = min(self._view_width, frame.width)
             if view > width:
                 width, height = view, max(height, round(frame.height * view / frame.width))
             rgb = self._jpeg.decode(frame.jpeg, min_width=width, min_height=height)
-        return Picture(frame, rgb, received_s, acquire_ms, (time.perf_counter() - began) * 1e3)
-
-    def detect(self, picture: Picture) -> DetectionResult:
-        """What the detector finds in the picture; raises DetectorError."""
-        return self.detector.detect(picture)
+        decode_ms = (time.perf_counter() - began) * 1e3
+        return DecodedFrame(frame, rgb, received_s, acquire_ms, decode_ms)

@@ -30,7 +30,7 @@ from bikeped.feedback import open_light
 from bikeped.feedback.light import LAMP_COLOURS
 from bikeped.feedback.sounds import make_wav
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
-from bikeped.pipeline.detection_stage import Picture
+from bikeped.pipeline.detection_stage import DecodedFrame
 from bikeped.pipeline.factory import load_detector_pool
 from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.telemetry.mqtt_auth import load_credentials
@@ -192,7 +192,7 @@ def check_model(loaded: LoadedConfig) -> Finding:
     times = []
     for _ in range(5):
         began = time.perf_counter()
-        detector.detect(Picture(frame, rgb, began, 0.0, 0.0))
+        detector.detect(DecodedFrame(frame, rgb, began, 0.0, 0.0))
         times.append((time.perf_counter() - began) * 1e3)
     ms = statistics.median(times)
     detail = f"{detector.name}: {ms:.1f} ms a frame, loaded in {loaded_s:.1f} s"

@@ -18,7 +18,7 @@ class Feed(Protocol):
 
     live: bool
 
-    async def next(self) -> tuple[Frame, float] | None:
+    async def next_frame(self) -> tuple[Frame, float] | None:
         """The next frame and how long getting it took in ms; None at the end of a recording."""
 
     def newest_s(self, now_s: float) -> float | None:
@@ -48,7 +48,7 @@ class LiveFeed:
     def __init__(self, grabber: FrameGrabber) -> None:
         self._grabber = grabber
 
-    async def next(self) -> tuple[Frame, float] | None:
+    async def next_frame(self) -> tuple[Frame, float] | None:
         while True:
             frame = await self._grabber.next(1.0)
             if frame is not None:
@@ -87,7 +87,7 @@ class RecordedFeed:
         self._reader = WorkerThread("read")
         self._ahead: asyncio.Future[tuple[Frame | None, float]] | None = None
 
-    async def next(self) -> tuple[Frame, float] | None:
+    async def next_frame(self) -> tuple[Frame, float] | None:
         ahead = self._ahead or self._reader.submit(_timed, self._source.read)
         frame, took_ms = await ahead
         if frame is None:

@@ -1,4 +1,4 @@
-"""Where one worker's picture waits for the next one."""
+"""The one decoded frame that may wait for the detector."""
 
 from __future__ import annotations
 
@@ -6,37 +6,38 @@ import asyncio
 from collections.abc import Coroutine
 from typing import Any
 
-from bikeped.pipeline.detection_stage import Picture
+from bikeped.pipeline.detection_stage import DecodedFrame
 
 
 class LatestFrameSlot:
-    """Room for one picture between two workers; None, put last, is the end."""
+    """Holds at most one decoded frame; None, put last, is the end."""
 
     def __init__(self) -> None:
-        self._item: Picture | None = None
-        self._filled, self._empty = asyncio.Event(), asyncio.Event()
+        self._item: DecodedFrame | None = None
+        self._full, self._empty = asyncio.Event(), asyncio.Event()
         self._empty.set()
         self.ended = False
 
-    async def room(self) -> None:
+    async def wait_empty(self) -> None:
         """Returns when the slot is empty."""
         await self._empty.wait()
 
-    def put(self, item: Picture | None) -> None:
+    async def wait_full(self) -> None:
+        """Returns when there is a frame, or the end."""
+        await self._full.wait()
+
+    def put(self, item: DecodedFrame | None) -> None:
+        """Fills the slot."""
         self._item = item
         self.ended = item is None
         self._empty.clear()
-        self._filled.set()
+        self._full.set()
 
-    async def filled(self) -> None:
-        """Returns when there is a picture, or the end."""
-        await self._filled.wait()
-
-    def take(self) -> Picture | None:
-        """The picture, if there is one now."""
+    def get_nowait(self) -> DecodedFrame | None:
+        """The frame, if there is one now."""
         item, self._item = self._item, None
         if item is not None:
-            self._filled.clear()
+            self._full.clear()
             self._empty.set()
         return item
 

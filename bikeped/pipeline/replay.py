@@ -20,9 +20,10 @@ from bikeped.overlay import VideoWriter
 from bikeped.pipeline.detection_stage import DetectionStage, DetectorPool, FrameDetector
 from bikeped.pipeline.factory import header_of, load_detector_pool, start_publisher
 from bikeped.pipeline.feed import RecordedFeed
+from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.health_report import report_health
-from bikeped.pipeline.loop import Loop, Output
+from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.replay_outputs import (
     OVERLAY_SIZE,
     EventFile,
@@ -156,7 +157,7 @@ async def _replay(
     detector: FrameDetector,
     files: ReplayFiles,
     mqtt: bool,
-    outputs: list[Output],
+    outputs: list[FrameResultListener],
     warnings: list[str],
     pages: Pages | None,
     serving: Callable[[str], None] | None,
@@ -197,7 +198,7 @@ async def _replay(
                 SignalLogic.from_config(config.feedback), light, listeners=(telemetry, *watchers)
             ),
             outputs=outputs,
-            max_inflight=detector.at_once if isinstance(detector, DetectorPool) else 1,
+            max_inflight=detector.max_inflight if isinstance(detector, DetectorPool) else 1,
         )
 
         def health() -> HealthMessage:

@@ -14,7 +14,7 @@ import numpy as np
 
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.overlay import OverlayData, VideoWriter, compose, ground_projector
-from bikeped.pipeline.loop import FrameResult
+from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.builders import EventHeader
@@ -37,7 +37,7 @@ class ReplaySummary:
     _episodes: EpisodeTracker = field(default_factory=EpisodeTracker)
 
     async def on_frame_result(self, result: FrameResult) -> None:
-        frame, tracking = result.picture.frame, result.tracking
+        frame, tracking = result.decoded.frame, result.tracking
         self.duration_s = result.t_s
         self.detections += len(result.detections)
         self.not_on_ground += tracking.not_on_ground
@@ -92,7 +92,7 @@ class OverlayVideo:
 
     async def on_frame_result(self, result: FrameResult) -> None:
         await self.wait()
-        frame, tracking = result.picture.frame, result.tracking
+        frame, tracking = result.decoded.frame, result.tracking
         overlay_data = OverlayData(
             detections=result.detections,
             tracks=tracking.tracks,
@@ -108,7 +108,7 @@ class OverlayVideo:
         def draw() -> None:
             self._sink.write(
                 compose(
-                    result.picture.rgb,
+                    result.decoded.rgb,
                     overlay_data,
                     self._sink.size,
                     frame_width=frame.width,

@@ -20,10 +20,11 @@ from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_drive
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.detection_stage import DetectionStage, FrameDetector
 from bikeped.pipeline.factory import header_of, load_detector_pool, start_publisher
+from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.health_report import report_health
-from bikeped.pipeline.loop import Limits, Loop, StageHangError
+from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.systemd import Notifier
 from bikeped.pipeline.telemetry import Telemetry
@@ -139,13 +140,15 @@ async def _serve(
             hang_after_s=camera.hang_after_s,
         ),
         on_tick=notifier.alive,
+        fault_sources=(
+            lambda: speaker.fault,
+            lambda: _audit_fault(audit),
+            lambda: light.fault,
+        ),
     )
 
     def health() -> HealthMessage:
-        faults = [fault for fault in (speaker.fault, light.fault) if fault is not None]
-        if audit is not None and audit.fault is not None:
-            faults.insert(0, Fault("audit", "audit.error", audit.fault))
-        return telemetry.health(loop, config.feedback.light, tuple(faults))
+        return telemetry.health(loop, config.feedback.light)
 
     if pages is not None and metrics is not None:
         web_context = WebContext(
@@ -240,3 +243,9 @@ async def _darken(light: LightDriver) -> None:
         log.info("stopped: the light is off")
     else:
         log.error("stopped, but the light does not answer and may still be on")
+
+
+def _audit_fault(audit: AuditLog | None) -> Fault | None:
+    if audit is None or audit.fault is None:
+        return None
+    return Fault("audit", "audit.error", audit.fault)

@@ -1,4 +1,4 @@
-"""What is shown now: one place that tells light, speaker and telemetry the same signal."""
+"""Sends one signal to the light, the speaker and all listeners."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STOPPED = "OFF: the service was stopped."
 
 
 class SignalListener(Protocol):
-    """Hears of every signal."""
+    """Takes every signal."""
 
     def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
         """What the light shows now, why, and the newest decision; with every frame and every tick.
@@ -27,7 +27,7 @@ class SignalListener(Protocol):
 
 
 class SignalDispatcher:
-    """Lets `logic` choose the signal and tells everybody. The light comes first."""
+    """Lets `logic` choose the signal and sends it on, to the light first."""
 
     def __init__(
         self,
@@ -42,41 +42,45 @@ class SignalDispatcher:
         self._limited_log = RateLimitedLogger(log)
         self.shown: Signal | None = None
 
-    def step(
+    def dispatch(
         self, now_s: float, decision: Decision | None, faults: tuple[Fault, ...] = ()
     ) -> Signal:
         """Shows what `decision` (None: no new one) and `faults` lead to at `now_s`."""
         if decision is not None:
             self._decision = decision
-        signal = self._logic.step(now_s, None if decision is None else decision.state, faults)
+        decided = None if decision is None else decision.state
+        signal = self._logic.next_signal(now_s, decided, faults)
         if signal.name == "FAULT" or self._decision is None:
-            self._tell(signal, "; ".join(fault_texts(signal.faults)))
+            self._send(signal, "; ".join(fault_texts(signal.faults)))
         else:
-            self._tell(signal, self._decision.sentence)
+            self._send(signal, self._decision.sentence)
         return signal
 
-    def off(self) -> None:
-        """Dark: nobody watches any more."""
-        self._tell(OFF, STOPPED)
+    def switch_off(self) -> None:
+        """Darkens the light: the crossing is no longer watched."""
+        self._send(OFF, STOPPED)
 
     def refresh(self) -> None:
-        """Shows the same once more, so that the light does not take the service for dead."""
+        """Shows the same signal again, so that the light's watchdog does not trip."""
         if self._light is not None and self.shown is not None:
             self._light.show(self.shown)
 
-    def _tell(self, signal: Signal, sentence: str) -> None:
+    def _send(self, signal: Signal, sentence: str) -> None:
         if self._light is not None:
             self._light.show(signal)
         if self._speaker is not None:
             self._speaker.play(signal.sound)
         if self.shown is None or self.shown.name != signal.name:
             known = sentence.startswith(f"{signal.name}:")
-            log.info("%s", sentence if known else f"{signal.name}: {sentence}")
+            # FAULT carries its causes; an ALERT beside a fault is not logged as one.
+            causes = signal.faults if signal.name == "FAULT" else ()
+            level = max((fault.kind.severity for fault in causes), default=logging.INFO)
+            log.log(level, "%s", sentence if known else f"{signal.name}: {sentence}")
         self.shown = signal
         for listener in self._listeners:
-            self._tell_listener(listener, signal, sentence)
+            self._send_to(listener, signal, sentence)
 
-    def _tell_listener(self, listener: SignalListener, signal: Signal, sentence: str) -> None:
+    def _send_to(self, listener: SignalListener, signal: Signal, sentence: str) -> None:
         try:
             listener.on_signal(signal, sentence, self._decision)
         except Exception as error:  # noqa: BLE001 - telemetry must not darken the light

@@ -14,7 +14,8 @@ from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
-from bikeped.pipeline.loop import FrameResult, Loop
+from bikeped.pipeline.frame_result import FrameResult
+from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import (
@@ -82,7 +83,7 @@ class Telemetry:
             self._next_tracks_s = self._due(now_s)
             message = tracks_message(
                 unix_s=self._wall() - result.latency_ms["capture_age"] / 1e3,
-                frame_number=result.picture.frame.number,
+                frame_number=result.decoded.frame.number,
                 state=_shown(result.signal),
                 tracks=result.tracking.tracks,
                 history=self._track_and_decide.tracker.history(),
@@ -112,13 +113,10 @@ class Telemetry:
         now_s = self._clock()
         return sum(now_s - at_s <= 2.0 for at_s in self._recent) / 2.0
 
-    def health(self, loop: Loop, light: str, faults: tuple[Fault, ...] = ()) -> HealthMessage:
-        """The health message now; `faults` are those that the light does not show.
-
-        `light` names the kind of light, as `feedback.light` does.
-        """
+    def health(self, loop: Loop, light: str) -> HealthMessage:
+        """The health message now; `light` names the kind of light, as `feedback.light` does."""
         signal = self._signal
-        faults = (*(signal.faults if signal else ()), *faults)
+        faults = (*(signal.faults if signal else ()), *loop.monitor.notices())
         age_s = loop.frame_age_s()
         age_ms = None if age_s is None else age_s * 1e3
         if age_ms is None and self._last is not None:
@@ -182,7 +180,7 @@ def event_line_for(result: FrameResult) -> EventLine:
     """The event line of an result."""
     return event_line(
         t_s=result.t_s,
-        frame=result.picture.frame.number,
+        frame=result.decoded.frame.number,
         decision=result.tracking.decision,
         tracks=result.tracking.tracks,
         detections=result.detections,

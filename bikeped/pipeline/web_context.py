@@ -11,7 +11,7 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 
 from bikeped.config import LoadedConfig, WebConfig
-from bikeped.pipeline.loop import Output
+from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.signal_dispatcher import SignalListener
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.builders import HealthMessage
@@ -32,7 +32,7 @@ class WebContext:
     mqtt: Callable[[], MqttStatus] | None  #: None: no broker is configured
 
 
-class Pages(Output, SignalListener, Protocol):
+class Pages(FrameResultListener, SignalListener, Protocol):
     """Pages hear every result and every signal, put them aside, and return at once."""
 
     def application(self, web_context: WebContext) -> web.Application:

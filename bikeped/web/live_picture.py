@@ -20,7 +20,7 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.errors import CaptureError
 from bikeped.overlay import OverlayData, draw_overlay, encode_jpeg, ground_projector
-from bikeped.pipeline.loop import FrameResult
+from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.rate_limited_log import RateLimitedLogger
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.pipeline.worker_threads import WorkerThread
@@ -119,7 +119,7 @@ class PictureRenderer:
         signal: Signal | None,
         history: Mapping[int, FloatArray],
     ) -> bytes:
-        frame, tracking = result.picture.frame, result.tracking
+        frame, tracking = result.decoded.frame, result.tracking
         overlay_data = OverlayData(
             detections=result.detections,
             tracks=tracking.tracks,
@@ -146,7 +146,7 @@ class PictureRenderer:
         )
 
     def _picture(self, decoder: JpegDecoder, result: FrameResult) -> ImageArray:
-        frame = result.picture.frame
+        frame = result.decoded.frame
         width = min(self._width, frame.width)
         height = max(1, round(frame.height * width / frame.width))
         if frame.jpeg is not None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import fault_texts
-from bikeped.pipeline.loop import FrameResult
+from bikeped.pipeline.frame_result import FrameResult
 from bikeped.telemetry.latency import STAGES
 from bikeped.types import Decision, Kind, PairMetrics, Signal, State
 
@@ -158,7 +158,7 @@ class LiveState:
             decided=None if decision is None else decision.state.name,
             faults=() if signal is None else fault_texts(signal.faults),
             signal_age_s=None if self._signal_s is None else now_s - self._signal_s,
-            frame=None if result is None else result.picture.frame.number,
+            frame=None if result is None else result.decoded.frame.number,
             frame_age_s=None if self._frame_s is None else now_s - self._frame_s,
             t_s=None if result is None else result.t_s,
             pair=None if result is None else _pair(result.tracking.decision.pair),

@@ -7,7 +7,7 @@ from functools import partial
 from aiohttp import web
 
 from bikeped.config import LoadedConfig
-from bikeped.pipeline.loop import FrameResult
+from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.telemetry import to_mapping
 from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.http_server import add_monitoring
@@ -46,4 +46,4 @@ class ServicePages:
 
     def newest(self) -> Frame | None:
         """The newest frame that was judged."""
-        return None if self.state.result is None else self.state.result.picture.frame
+        return None if self.state.result is None else self.state.result.decoded.frame

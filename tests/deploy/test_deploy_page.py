@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -13,7 +14,7 @@ from bikeped.config.schema.inputs import Config
 from bikeped.errors import GeometryError
 from bikeped.faults import Fault
 from bikeped.feedback.light import NOT_REFRESHED
-from bikeped.feedback.signal import assess
+from bikeped.pipeline.fault_monitor import FaultMonitor, Limits
 
 PAGE = (Path(__file__).parents[2] / "docs" / "install-on-a-pole.md").read_text()
 KEYS = sorted(
@@ -56,10 +57,15 @@ def test_only_commands_of_the_interface_are_used() -> None:
 def test_the_fault_table_has_the_texts_that_the_code_writes() -> None:
     with pytest.raises(GeometryError) as error:
         framing(load_config(None)).for_frame(64, 64)
+    feed = SimpleNamespace(live=True, error=lambda: None, newest_s=lambda _: None)
+    monitor = FaultMonitor(feed, Limits())  # type: ignore[arg-type]
+    begin = monitor.faults(0.0)
+    feed.newest_s = lambda _: 0.0
+    monitor.processed(0.0)
     misfit = Fault("geometry", "camera.frame_size", str(error.value))
     faults = [
-        *assess(0, None, None, 1, 1),
-        *assess(9, 0, 0, 1, 1),
+        *begin,
+        *monitor.faults(9.0),
         misfit,
         NOT_REFRESHED,
     ]

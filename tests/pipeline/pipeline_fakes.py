@@ -10,10 +10,12 @@ import numpy as np
 
 from bikeped.config import LoadedConfig, parse_config
 from bikeped.detection.base import DetectionResult
-from bikeped.faults import fault_texts
+from bikeped.faults import Fault, fault_texts
 from bikeped.feedback import SignalLogic
-from bikeped.pipeline.detection_stage import DetectionStage, Picture
-from bikeped.pipeline.loop import FrameResult, Limits, Loop
+from bikeped.pipeline.detection_stage import DecodedFrame, DetectionStage
+from bikeped.pipeline.fault_monitor import Limits
+from bikeped.pipeline.frame_result import FrameResult
+from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Decision, Detections, Frame, Kind, Signal
@@ -70,7 +72,7 @@ class FakeFeed:
         self.queue.put_nowait(Frame(self.number, captured_s, **values))  # type: ignore[arg-type]
         self.number += 1
 
-    async def next(self) -> tuple[Frame, float] | None:
+    async def next_frame(self) -> tuple[Frame, float] | None:
         item = await self.queue.get()
         if isinstance(item, Exception):
             raise item
@@ -113,7 +115,7 @@ class FakeDetector:
     def decode_size(self, width: int, height: int) -> tuple[int, int]:
         return width, height
 
-    def detect(self, picture: Picture) -> DetectionResult:
+    def detect(self, picture: DecodedFrame) -> DetectionResult:
         self.calls += 1
         self.entered.set()
         self.go.wait(PATIENCE_S)
@@ -189,6 +191,7 @@ class Rig:
         self.limits = Limits(tick_s=0.005, close_s=0.05)
         self.track_and_decide = TrackAndDecide(self.config)
         self.max_inflight = 1
+        self.fault_sources: list[Callable[[], Fault | None]] = []
 
     def start(self) -> None:
         self.dispatcher = SignalDispatcher(
@@ -206,6 +209,7 @@ class Rig:
             clock=self.clock,
             on_tick=self.recorder.tick,
             max_inflight=self.max_inflight,
+            fault_sources=self.fault_sources,
         )
         self.task = asyncio.create_task(self.loop.run())
 

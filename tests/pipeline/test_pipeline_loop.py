@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from pipeline_fakes import PATIENCE_S, FakeDetector, Rig, seen, small
 
-import bikeped.pipeline.loop as loop_module
+import bikeped.pipeline.detection_scheduler as scheduler_module
 from bikeped.detection.base import DetectionResult
 from bikeped.errors import CaptureError, DetectorError, GeometryError
-from bikeped.pipeline.detection_stage import Picture
+from bikeped.pipeline.detection_stage import DecodedFrame
+from bikeped.pipeline.fault_monitor import RESTART_AFTER_S, Limits, StageHangError
+from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.latest_frame_slot import LatestFrameSlot
-from bikeped.pipeline.loop import RESTART_AFTER_S, FrameResult, Limits, StageHangError
 from bikeped.types import Colour, Kind
 
 REASSURING = {Colour.BLUE, Colour.GREEN}
@@ -271,7 +272,7 @@ async def test_a_recording_ends_the_loop_after_its_last_frame():
     async with Rig(live=False) as rig:
         rig.recorded(10)
         await rig.ended()
-        assert [o.picture.frame.number for o in rig.recorder.results] == list(range(10))
+        assert [o.decoded.frame.number for o in rig.recorder.results] == list(range(10))
         assert rig.recorder.ticks == 0  # a recording is not late
 
 
@@ -283,7 +284,7 @@ class PatientDetector(FakeDetector):
         self.put = 0
         self.changed = threading.Condition()
 
-    def detect(self, picture: Picture) -> DetectionResult:
+    def detect(self, picture: DecodedFrame) -> DetectionResult:
         answer = super().detect(picture)
         with self.changed:
             assert self.changed.wait_for(lambda: self.put >= picture.frame.number + 2, PATIENCE_S)
@@ -296,7 +297,7 @@ async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
     judged: list[int] = []
 
     class Watched(LatestFrameSlot):
-        def put(self, item: Picture | None) -> None:
+        def put(self, item: DecodedFrame | None) -> None:
             super().put(item)
             with detector.changed:
                 detector.put += 1
@@ -306,13 +307,13 @@ async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
         """Takes an result only when the detector has begun with the next frame."""
 
         async def on_frame_result(self, result: FrameResult) -> None:
-            judged.append(result.picture.frame.number)
+            judged.append(result.decoded.frame.number)
             deadline = asyncio.get_running_loop().time() + PATIENCE_S
             while judged[-1] < 9 and detector.calls < judged[-1] + 2:
                 assert asyncio.get_running_loop().time() < deadline
                 await asyncio.sleep(0)
 
-    monkeypatch.setattr(loop_module, "LatestFrameSlot", Watched)
+    monkeypatch.setattr(scheduler_module, "LatestFrameSlot", Watched)
     rig.outputs.append(Output())
     rig.recorded(10)
     async with rig:
@@ -328,7 +329,7 @@ class PairedDetector(FakeDetector):
         self.both = threading.Barrier(2, timeout=PATIENCE_S)
         self.later = threading.Event()
 
-    def detect(self, picture: Picture) -> DetectionResult:
+    def detect(self, picture: DecodedFrame) -> DetectionResult:
         self.both.wait()
         if picture.frame.number % 2:
             self.later.set()
@@ -348,7 +349,7 @@ async def test_two_looks_at_once_are_judged_in_order(count):
     rig.recorded(count)
     async with rig:
         await rig.ended()
-    assert [o.picture.frame.number for o in rig.recorder.results] == list(range(count))
+    assert [o.decoded.frame.number for o in rig.recorder.results] == list(range(count))
 
 
 async def test_the_second_of_two_looks_fails_after_the_first_is_judged():
@@ -361,7 +362,7 @@ async def test_the_second_of_two_looks_fails_after_the_first_is_judged():
         with pytest.raises(DetectorError, match="out of memory"):
             await rig.ended()
         rig.detector.both.abort()  # whoever looks now
-    assert [o.picture.frame.number for o in rig.recorder.results] == [0, 1, 2, 3, 4]
+    assert [o.decoded.frame.number for o in rig.recorder.results] == [0, 1, 2, 3, 4]
 
 
 async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
@@ -370,7 +371,7 @@ async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
 
     class Output:
         async def on_frame_result(self, result: FrameResult) -> None:
-            judged.append(result.picture.frame.number)
+            judged.append(result.decoded.frame.number)
             if len(judged) == 3:
                 rig.detector.error = DetectorError("out of memory")
 
@@ -392,7 +393,7 @@ async def test_frames_before_one_of_other_proportions_are_judged(looks):
     async with rig:
         with pytest.raises(GeometryError):
             await rig.ended()
-    assert [o.picture.frame.number for o in rig.recorder.results] == list(range(6))
+    assert [o.decoded.frame.number for o in rig.recorder.results] == list(range(6))
 
 
 async def test_an_output_that_fails_while_the_eye_hangs_ends_a_replay():

@@ -87,10 +87,10 @@ async def test_a_recorded_feed_gives_every_frame_and_then_the_end(make_clip):
     source = open_source(str(make_clip("c.avi", 7)), width=96, height=64, fps=30, fourcc="MJPG")
     feed = RecordedFeed(source)
     numbers = []
-    while (taken := await feed.next()) is not None:
+    while (taken := await feed.next_frame()) is not None:
         numbers.append(taken[0].number)
     assert numbers == list(range(7))
-    assert await feed.next() is None
+    assert await feed.next_frame() is None
     await feed.close()
 
 
@@ -114,7 +114,7 @@ class Slow:
 async def test_a_recorded_feed_closes_its_source_after_the_read_under_way():
     source = Slow()
     feed = RecordedFeed(source)  # type: ignore[arg-type]
-    reading = asyncio.create_task(feed.next())
+    reading = asyncio.create_task(feed.next_frame())
     assert await asyncio.to_thread(source.entered.wait, PATIENCE_S)
     reading.cancel()
     source.go.set()
@@ -130,7 +130,7 @@ async def test_a_live_feed_that_ended_says_so_and_one_that_broke_says_why(make_c
     grabber = FrameGrabber(Ends)  # type: ignore[arg-type]
     grabber.start()
     feed = LiveFeed(grabber)
-    assert await asyncio.wait_for(feed.next(), PATIENCE_S) is None
+    assert await asyncio.wait_for(feed.next_frame(), PATIENCE_S) is None
     assert feed.newest_s(1.0) is None
     assert feed.error() is None
     await feed.close()

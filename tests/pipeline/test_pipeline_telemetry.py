@@ -11,7 +11,7 @@ from pipeline_fakes import Clock, Rig, seen, small
 from prometheus_client import generate_latest
 
 from bikeped.errors import DetectorError
-from bikeped.faults import Fault
+from bikeped.faults import FAULT_KINDS, Clears, Effect, Fault, FaultKind, Severity
 from bikeped.feedback import SignalLogic
 from bikeped.pipeline.health_report import health_line, report_health
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
@@ -133,12 +133,14 @@ async def test_every_frame_is_a_line_of_the_audit_log():
 
 
 async def test_health_says_what_is_wrong_and_how_old_the_newest_frame_is(small_jpegs):
-    async with TelemetryRig() as rig:
+    rig, audit = TelemetryRig(), [None]
+    rig.fault_sources.append(lambda: audit[0])
+    async with rig:
         valid("health", encode(rig.telemetry.health(rig.loop, "simulated")))  # before any frame
         await rig.well()
         await rig.frames(1, jpeg=b"junk")
-        full = Fault("audit", "audit.error", "full")
-        message = valid("health", encode(rig.telemetry.health(rig.loop, "gpio", (full,))))
+        audit[0] = Fault("audit", "audit.error", "full")
+        message = valid("health", encode(rig.telemetry.health(rig.loop, "gpio")))
         assert message["camera"]["ok"]
         assert message["faults"] == ["audit: full"]
         assert message["fault_codes"] == ["audit.error"]
@@ -175,6 +177,39 @@ async def test_a_geometry_fault_makes_the_cameras_health_bad_and_no_other():
         assert message["fault_codes"] == ["camera.frame_size"]
         await rig.frames(5)
         assert json.loads(encode(rig.telemetry.health(rig.loop, "simulated")))["camera"]["ok"]
+
+
+@pytest.mark.parametrize("effect", [Effect.FAULT, Effect.NOTICE])
+async def test_a_new_fault_needs_a_row_of_the_table_and_a_source(monkeypatch, effect):
+    """The made-up `camera.lens_wet`: light, health, message and codes follow from its row."""
+    row = FaultKind(
+        "camera.lens_wet",
+        "camera",
+        effect,
+        Severity.WARNING,
+        Clears.GOOD_FRAMES,
+        "There are drops on the lens.",
+    )
+    monkeypatch.setitem(FAULT_KINDS, row.code, row)
+    wet = []
+    rig = TelemetryRig()
+    rig.fault_sources.append(lambda: wet[0] if wet else None)
+    async with rig:
+        await rig.well()
+        wet.append(Fault("camera", "camera.lens_wet", "drops on the lens"))
+        await rig.recorder.some_ticks()
+        message = valid("health", encode(rig.telemetry.health(rig.loop, "simulated")))
+        assert message["faults"] == ["camera: drops on the lens"]
+        assert message["fault_codes"] == ["camera.lens_wet"]
+        assert message["camera"]["detail"] == "camera: drops on the lens"
+        assert not message["camera"]["ok"]
+        assert message["detector"]["ok"]
+        expected = "FAULT" if effect is Effect.FAULT else "IDLE"
+        assert rig.recorder.name == message["state"] == expected
+        assert rig.publisher.of("state")[-1]["state"] == expected
+        wet.clear()
+        await rig.frames(5)
+        assert rig.recorder.name == "IDLE"
 
 
 async def test_metrics_count_what_no_single_frame_tells():
@@ -241,14 +276,14 @@ async def test_a_failing_health_report_costs_a_message_and_no_more(caplog):
         assert "health: a bug" in caplog.text
 
 
-def test_the_announcer_refreshes_what_it_shows():
+def test_the_dispatcher_refreshes_what_it_shows():
     from pipeline_fakes import FakeLight
 
     light = FakeLight()
     dispatcher = SignalDispatcher(SignalLogic(), light)  # type: ignore[arg-type]
     dispatcher.refresh()
     assert light.shown == []
-    dispatcher.off()
+    dispatcher.switch_off()
     dispatcher.refresh()
     assert [signal.name for signal in light.shown] == ["OFF", "OFF"]
 

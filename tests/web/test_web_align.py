@@ -250,7 +250,7 @@ async def test_the_service_s_newest_frame_is_the_picture(place: Path, start) -> 
     result = Scene(within.track_and_decide).next()
     await pages.on_frame_result(result)
     answer = await client.get("/align/frame.jpg")
-    assert await answer.read() == bytes(result.picture.frame.jpeg or b"")
+    assert await answer.read() == bytes(result.decoded.frame.jpeg or b"")
     state = await (await client.get("/align/state")).json()
     assert state["live"]
     ask = {"values": state["running"], "frame": {"width": 960, "height": 640}}

@@ -271,7 +271,7 @@ async def test_many_lookers_share_one_drawing(make_page):
 async def test_a_damaged_frame_is_a_picture_less_and_no_more(make_page, caplog):
     page = await make_page("web.stream_fps=30")
     result = page.scene.next()
-    object.__setattr__(result.picture.frame, "jpeg", b"\xff\xd8 no picture")
+    object.__setattr__(result.decoded.frame, "jpeg", b"\xff\xd8 no picture")
     await page.state.on_frame_result(result)
     async with aiohttp.ClientSession() as session, session.get(f"{page.url}/live/stream") as answer:
         waiting = asyncio.create_task(Pictures(answer).next())

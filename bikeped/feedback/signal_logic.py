@@ -1,0 +1,136 @@
+"""Which signal the light and the speaker show: FAULT, recovery and the hold of ALERT. Pure.
+
+The table of states is the paper's table 2; FAULT is bikeped's addition.
+
+| name    | light                          | sound                |
+| ------- | ------------------------------ | -------------------- |
+| IDLE    | blue, steady                   | none                 |
+| SAFE    | green, steady                  | chime, once on entry |
+| WARNING | orange, steady                 | none                 |
+| ALERT   | red, blinking at `blink_hz`    | bell                 |
+| FAULT   | orange, blinking slowly        | none                 |
+| OFF     | dark (the service has stopped) | none                 |
+
+The machine counts good frames: new decisions without a fault, in a row. It starts at 0.
+
+| count              | a fault        | a good frame | a tick without a decision | shows         |
+| ------------------ | -------------- | ------------ | ------------------------- | ------------- |
+| < `recover_frames` | becomes 0      | one more     | stays                     | FAULT         |
+| `recover_frames`   | becomes 0      | stays        | stays                     | last decision |
+
+* A new ALERT shows red at once: at the start, during recovery and beside a fault too. Early red
+  reassures no one. A decision that cannot be trusted is passed as None.
+* ALERT is held for `hold_alert_s`, so that a single frame of it is visible. The hold outlives a
+  fault that begins meanwhile, but a fault does not renew it: red ends with the hold, then FAULT.
+* Blue, green and steady orange need the full count: a light never shows them before frames came.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bikeped.faults import Fault
+from bikeped.types import Colour, Signal, Sound, State
+
+if TYPE_CHECKING:
+    from bikeped.config import FeedbackConfig
+
+#: The fault shown before the first `recover_frames` good frames.
+STARTING = Fault("starting", "service.starting", "not enough good frames yet")
+
+OFF = Signal("OFF", Colour.OFF)
+
+_STEADY = {State.IDLE: Colour.BLUE, State.SAFE: Colour.GREEN, State.WARNING: Colour.ORANGE}
+
+
+def fault_signal(faults: tuple[Fault, ...], blink_hz: float) -> Signal:
+    """FAULT as the light shows it: orange, slowly blinking, never a steady colour.
+
+    Raises ValueError when `blink_hz` is not above zero, for steady orange would say WARNING.
+    """
+    if not blink_hz > 0:
+        raise ValueError(f"FAULT must blink: expected blink_hz > 0, got {blink_hz}")
+    return Signal("FAULT", Colour.ORANGE, blink_hz, Sound.NONE, faults)
+
+
+class SignalLogic:
+    """Turns decisions and faults into signals; one instance a light.
+
+    `blink_hz` and `fault_blink_hz` in flashes per second, `hold_alert_s` in seconds,
+    `recover_frames` in frames. ValueError for a light that would not blink.
+    """
+
+    def __init__(
+        self,
+        *,
+        blink_hz: float = 2.0,
+        fault_blink_hz: float = 0.5,
+        hold_alert_s: float = 1.0,
+        recover_frames: int = 5,
+    ) -> None:
+        if not blink_hz > 0:
+            raise ValueError(f"ALERT must blink: expected blink_hz > 0, got {blink_hz}")
+        fault_signal((), fault_blink_hz)
+        self._blink_hz = blink_hz
+        self._fault_blink_hz = fault_blink_hz
+        self._hold_alert_s = hold_alert_s
+        self._recover_frames = recover_frames
+        self._good_frames = 0
+        self._recovering_from: tuple[Fault, ...] = (STARTING,)
+        self._decided: State | None = None  # by the newest good frame
+        self._alert_s: float | None = None  # time of the newest ALERT
+        self._shown = "FAULT"
+
+    @classmethod
+    def from_config(cls, feedback: FeedbackConfig) -> SignalLogic:
+        """The logic with the timings of the configuration's `feedback` section."""
+        return cls(
+            blink_hz=feedback.blink_hz,
+            fault_blink_hz=feedback.fault_blink_hz,
+            hold_alert_s=feedback.hold_alert_s,
+            recover_frames=feedback.recover_frames,
+        )
+
+    def next_signal(
+        self, now_s: float, decided: State | None, faults: tuple[Fault, ...] = ()
+    ) -> Signal:
+        """The signal at `now_s`, in seconds of one monotonic clock.
+
+        `decided` is the state of a new frame, None on a tick of the clock or when the decision
+        cannot be trusted. `faults` are those present now whose effect on the light is FAULT. The
+        chime is in the one signal in which SAFE begins.
+        """
+        if decided is State.ALERT:
+            self._alert_s = now_s
+        if faults:
+            self._good_frames = 0
+            self._recovering_from = tuple(
+                Fault("recovering", "service.recovering", str(fault)) for fault in faults
+            )
+        elif decided is not None:
+            self._decided = decided
+            self._good_frames = min(self._good_frames + 1, self._recover_frames)
+        trusted = self._decided if self._good_frames >= self._recover_frames else None
+
+        if self._alert_held(now_s) or trusted is State.ALERT:
+            # The faults travel with the red light, so that telemetry sees them.
+            signal = Signal("ALERT", Colour.RED, self._blink_hz, Sound.BELL, faults)
+        elif trusted is None:
+            signal = fault_signal(faults or self._recovering_from, self._fault_blink_hz)
+        else:
+            begins = trusted is State.SAFE and self._shown != "SAFE"
+            sound = Sound.CHIME if begins else Sound.NONE
+            signal = Signal(trusted.name, _STEADY[trusted], sound=sound)
+        self._shown = signal.name
+        return signal
+
+    def _alert_held(self, now_s: float) -> bool:
+        """Whether the newest ALERT still keeps the light red.
+
+        A clock that stepped back (a recording that loops) ends the hold and never prolongs it.
+        """
+        if self._alert_s is None:
+            return False
+        age_s = now_s - self._alert_s
+        # The call that brought the ALERT shows it even with hold_alert_s = 0.
+        return age_s == 0 or 0 <= age_s < self._hold_alert_s

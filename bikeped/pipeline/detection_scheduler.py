@@ -1,0 +1,176 @@
+"""Which frame is decoded and detected when: one may wait, the results keep the frames' order."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from bikeped.detection.base import DetectionResult
+from bikeped.errors import BikepedError, CaptureError, GeometryError
+from bikeped.pipeline.detection_stage import DecodedFrame, DetectionStage
+from bikeped.pipeline.fault_monitor import FaultMonitor
+from bikeped.pipeline.feed import Feed
+from bikeped.pipeline.frame_result import FrameCounts
+from bikeped.pipeline.latest_frame_slot import LatestFrameSlot, first_of
+from bikeped.pipeline.rate_limited_log import RateLimitedLogger
+from bikeped.pipeline.worker_threads import WorkerThread
+
+log = logging.getLogger(__name__)
+
+_NEWEST_WEIGHT = 0.2  #: of the newest duration in the usual one
+
+
+@dataclass(frozen=True)
+class _InFlight:
+    """A frame that a detector thread works on since `began_s`, and its future answer."""
+
+    decoded: DecodedFrame
+    worker: WorkerThread
+    began_s: float
+    answer: asyncio.Future[DetectionResult]
+
+
+class DetectionScheduler:
+    """Takes frames from `feed`, decodes and detects them in threads, awaits `on_answer` for each.
+
+    One thread decodes, `max_inflight` threads detect. `check_size` raises nothing and returns why a
+    frame of this width and height does not fit the configured camera. On a live feed a frame that
+    fails costs itself, is counted and reported to `monitor`; in a recording the error ends
+    `detect_frames`, after the frames before it were passed on.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        detection: DetectionStage,
+        monitor: FaultMonitor,
+        counts: FrameCounts,
+        check_size: Callable[[int, int], GeometryError | None],
+        on_size_error: Callable[[], None],
+        on_answer: Callable[[DecodedFrame, DetectionResult], Awaitable[None]],
+        *,
+        max_inflight: int,
+        clock: Callable[[], float],
+    ) -> None:
+        self._feed, self._detection = feed, detection
+        self._monitor, self._counts = monitor, counts
+        self._check_size, self._on_size_error = check_size, on_size_error
+        self._on_answer, self._clock = on_answer, clock
+        self._slot = LatestFrameSlot()
+        self._decoder = WorkerThread("decode", clock)
+        self._idle = [WorkerThread("detect", clock) for _ in range(max_inflight)]
+        self.workers = (self._decoder, *self._idle)
+        self._inflight = deque[_InFlight]()
+        self._usual_detect_s = self._usual_decode_s = 0.0
+        self._limited_log = RateLimitedLogger(log)
+
+    async def close(self, timeout_s: float) -> None:
+        """Ends the threads; one that hangs is left behind after `timeout_s`."""
+        await asyncio.gather(*(worker.close(timeout_s) for worker in self.workers))
+
+    async def decode_frames(self) -> None:
+        """Decodes frame after frame, until the feed ends."""
+        while True:
+            # Room first, then the frame: a live frame taken early would only grow old.
+            await self._slot.wait_empty()
+            await self._wait_for_detector()
+            taken = await self._feed.next_frame()
+            if taken is None:
+                self._slot.put(None)
+                return
+            frame, acquire_ms = taken
+            self._counts.received += 1
+            began = time.perf_counter()
+            try:
+                decoded = await self._decoder.submit(
+                    self._detection.decode, frame, began, acquire_ms
+                )
+            except CaptureError as error:
+                self._counts.undecodable += 1
+                self._limited_log.warn("decode", f"frame {frame.number} is skipped: {error}")
+                self._monitor.not_decoded(error, self._clock())
+                continue
+            self._monitor.decoded()
+            self._usual_decode_s += _NEWEST_WEIGHT * (
+                decoded.decode_ms / 1e3 - self._usual_decode_s
+            )
+            self._slot.put(decoded)
+
+    async def _wait_for_detector(self) -> None:
+        """Waits until the detector is nearly free: a live frame taken earlier ages in the slot.
+
+        A recording does not age; there a wait would only cost throughput.
+        """
+        if self._feed.live and self._inflight:
+            free_s = self._inflight[0].began_s + self._usual_detect_s
+            ahead_s = 2 * self._usual_decode_s + 0.005
+            await asyncio.sleep(min(max(free_s - ahead_s - time.perf_counter(), 0.0), 0.2))
+
+    async def detect_frames(self) -> None:
+        """Keeps every detector thread busy and passes the answers on in the frames' order."""
+        slot, inflight = self._slot, self._inflight
+        try:
+            while not (slot.ended and not inflight):
+                self._dispatch()
+                if not inflight:
+                    await slot.wait_full()
+                    continue
+                if self._idle and not slot.ended:
+                    await first_of(inflight[0].answer, slot.wait_full())
+                else:
+                    await asyncio.wait({inflight[0].answer})
+                if not inflight[0].answer.done():
+                    continue
+                oldest = inflight.popleft()
+                self._idle.append(oldest.worker)
+                answer = self._result(oldest)
+                # The next frame is detected while this one is processed: detection takes longest.
+                self._dispatch()
+                if answer is not None:
+                    await self._on_answer(oldest.decoded, answer)
+        finally:
+            for frame in inflight:
+                if not frame.answer.cancel() and not frame.answer.cancelled():
+                    frame.answer.exception()  # retrieved, so that asyncio does not log it
+
+    def _dispatch(self) -> None:
+        """Hands the waiting frame to an idle detector thread."""
+        while self._idle and (decoded := self._slot.get_nowait()) is not None:
+            error = self._check_size(decoded.frame.width, decoded.frame.height)
+            if self._feed.live:
+                self._monitor.sized(error)
+                if error is not None:
+                    self._on_size_error()
+                    continue
+            worker, began_s = self._idle.pop(), time.perf_counter()
+            if error is None:
+                answer = worker.submit(self._detection.detect, decoded)
+            else:
+                # Ends the replay after the frames before it.
+                answer = asyncio.get_running_loop().create_future()
+                answer.set_exception(error)
+            self._inflight.append(_InFlight(decoded, worker, began_s, answer))
+
+    def _result(self, done: _InFlight) -> DetectionResult | None:
+        """The detector's answer; None when it failed on a live frame."""
+        took_s = time.perf_counter() - done.began_s
+        self._usual_detect_s += _NEWEST_WEIGHT * (took_s - self._usual_detect_s)
+        try:
+            answer = done.answer.result()
+        except Exception as error:
+            if not self._feed.live:
+                raise
+            self._counts.failed += 1
+            if isinstance(error, BikepedError):
+                number = done.decoded.frame.number
+                self._limited_log.warn("detector", f"frame {number} is skipped: {error}")
+            else:
+                self._limited_log.failure("detector", error)
+            self._monitor.not_answered(error, self._clock())
+            return None
+        self._monitor.answered()
+        return answer

@@ -1,0 +1,95 @@
+"""The result of one frame, and how it reaches telemetry, files and pages."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from bikeped.detection.base import DetectionResult
+from bikeped.pipeline.detection_stage import DecodedFrame
+from bikeped.pipeline.rate_limited_log import RateLimitedLogger
+from bikeped.pipeline.track_and_decide import TrackingResult
+from bikeped.types import Detections, Signal
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """One frame on its whole way; `t_s` is its capture time since the first result."""
+
+    decoded: DecodedFrame
+    t_s: float
+    detections: Detections
+    tracking: TrackingResult
+    signal: Signal
+    latency_ms: dict[str, float]  #: by stage, with `total` and `capture_age`
+
+
+@dataclass
+class FrameCounts:
+    """Totals since the start."""
+
+    received: int = 0
+    frames: int = 0  #: that led to a decision
+    undecodable: int = 0
+    failed: int = 0  #: the detector raised
+    out_of_order: int = 0
+
+
+class FrameResultListener(Protocol):
+    """Takes frame results: telemetry, audit log, event file, overlay."""
+
+    async def on_frame_result(self, result: FrameResult) -> None:
+        """One frame's result. On a live feed it is only queued: the loop waits for this."""
+
+
+class FrameResultDispatcher:
+    """Hands every result to all listeners; a listener's error ends a replay, never a live loop."""
+
+    def __init__(self, listeners: Sequence[FrameResultListener], *, live: bool) -> None:
+        self._listeners, self._live = tuple(listeners), live
+        self._limited_log = RateLimitedLogger(log)
+
+    async def dispatch(self, result: FrameResult) -> None:
+        for listener in self._listeners:
+            await self._send(listener, result)
+
+    async def _send(self, listener: FrameResultListener, result: FrameResult) -> None:
+        try:
+            await listener.on_frame_result(result)
+        except Exception as error:
+            if not self._live:
+                raise
+            self._limited_log.failure("output", error)
+
+
+def stage_latencies(
+    decoded: DecodedFrame,
+    answer: DetectionResult,
+    tracking: TrackingResult,
+    feedback_ms: float,
+    total_ms: float | None,
+) -> dict[str, float]:
+    """Milliseconds by stage: the paper's, `acquire`, their `total`, and `capture_age`.
+
+    `total_ms` is measured from taking the frame over to setting the light; None sums the stages,
+    as for a recording: it is decoded ahead, as no camera could be, and waiting is no latency.
+    """
+    stages = {
+        "pre": decoded.decode_ms + answer.pre_ms,
+        "inference": answer.inference_ms,
+        "post": answer.post_ms,
+        "track": tracking.track_ms,
+        "decide": tracking.decide_ms,
+        "feedback": feedback_ms,
+    }
+    total_ms = sum(stages.values()) if total_ms is None else total_ms
+    return {
+        "acquire": decoded.acquire_ms,
+        **stages,
+        "total": total_ms,
+        "capture_age": total_ms + decoded.acquire_ms,
+    }

@@ -1,0 +1,245 @@
+"""Signals: the table of states, the hold of ALERT, and what it takes to leave FAULT."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bikeped.config import FeedbackConfig
+from bikeped.faults import Fault
+from bikeped.feedback.signal_logic import OFF, STARTING, SignalLogic, fault_signal
+from bikeped.types import Colour, Signal, Sound, State
+
+FRAME_S = 1 / 30
+CAMERA = (Fault("camera", "camera.no_frame", "no frame for more than 0.5 s"),)
+
+
+def recovered(**timings: float) -> tuple[SignalLogic, float]:
+    """Logic that has left FAULT showing IDLE, and the time."""
+    logic = SignalLogic(**{"recover_frames": 5, **timings})  # type: ignore[arg-type]
+    now_s = 100.0
+    for _ in range(5):
+        signal = logic.next_signal(now_s, State.IDLE)
+        now_s += FRAME_S
+    assert signal.name == "IDLE"
+    return logic, now_s
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [
+        (State.IDLE, Signal("IDLE", Colour.BLUE)),
+        (State.SAFE, Signal("SAFE", Colour.GREEN, sound=Sound.CHIME)),
+        (State.WARNING, Signal("WARNING", Colour.ORANGE)),
+        (State.ALERT, Signal("ALERT", Colour.RED, 2.0, Sound.BELL)),
+    ],
+)
+def test_each_state_shows_as_in_the_papers_table(state: State, expected: Signal) -> None:
+    logic, now_s = recovered()
+    assert logic.next_signal(now_s, state) == expected
+
+
+def test_off_is_dark_and_silent() -> None:
+    assert Signal("OFF", Colour.OFF) == OFF
+
+
+def test_configuration_sets_the_timings() -> None:
+    config = FeedbackConfig(blink_hz=3.0, fault_blink_hz=0.25, hold_alert_s=0.0, recover_frames=1)
+    logic = SignalLogic.from_config(config)
+    assert logic.next_signal(0.0, None) == Signal("FAULT", Colour.ORANGE, 0.25, faults=(STARTING,))
+    assert logic.next_signal(0.1, State.ALERT) == Signal("ALERT", Colour.RED, 3.0, Sound.BELL)
+    assert logic.next_signal(0.2, State.IDLE).name == "IDLE"
+
+
+def test_chime_sounds_once_when_safe_begins() -> None:
+    logic, now_s = recovered()
+    states = [State.SAFE, State.SAFE, State.IDLE, State.SAFE, State.SAFE]
+    sounds = [logic.next_signal(now_s + i * FRAME_S, state).sound for i, state in enumerate(states)]
+    assert sounds == [Sound.CHIME, Sound.NONE, Sound.NONE, Sound.CHIME, Sound.NONE]
+
+
+def test_a_tick_without_a_decision_keeps_the_state() -> None:
+    logic, now_s = recovered()
+    logic.next_signal(now_s, State.WARNING)
+    assert logic.next_signal(now_s + 0.3, None).name == "WARNING"
+
+
+def test_one_frame_of_alert_is_held_and_then_gives_way() -> None:
+    logic, now_s = recovered(hold_alert_s=1.0)
+    logic.next_signal(now_s, State.ALERT)
+    assert logic.next_signal(now_s + 0.99, State.IDLE).name == "ALERT"
+    assert logic.next_signal(now_s + 1.0, State.IDLE).name == "IDLE"
+
+
+def test_a_clock_that_steps_back_does_not_prolong_the_hold() -> None:
+    logic, now_s = recovered(hold_alert_s=1.0)
+    logic.next_signal(now_s, State.ALERT)
+    assert logic.next_signal(now_s - 50, State.IDLE).name == "IDLE"
+
+
+def test_starts_in_fault_and_needs_good_frames_in_a_row() -> None:
+    logic = SignalLogic(recover_frames=3)
+    names = [
+        logic.next_signal(0.0, None),
+        logic.next_signal(0.1, State.IDLE),
+        logic.next_signal(0.2, State.IDLE),
+        logic.next_signal(0.3, None),  # a tick is no evidence, and does not undo any
+        logic.next_signal(0.4, State.SAFE),
+    ]
+    assert [signal.name for signal in names] == ["FAULT"] * 4 + ["SAFE"]
+    assert names[0].faults == (STARTING,)
+
+
+def test_a_fault_shows_at_once_and_counting_starts_again() -> None:
+    logic, now_s = recovered()
+    fault = logic.next_signal(now_s, None, CAMERA)
+    assert fault == Signal("FAULT", Colour.ORANGE, 0.5, faults=CAMERA)
+    good = [logic.next_signal(now_s + i * FRAME_S, State.IDLE) for i in range(1, 5)]
+    assert {signal.name for signal in good} == {"FAULT"}
+    assert good[0].faults == (Fault("recovering", "service.recovering", str(CAMERA[0])),)
+    logic.next_signal(now_s + 0.2, None, CAMERA)
+    later = [logic.next_signal(now_s + 1 + i * FRAME_S, State.IDLE).name for i in range(5)]
+    assert later == ["FAULT"] * 4 + ["IDLE"]
+
+
+def test_the_state_before_a_fault_is_forgotten() -> None:
+    logic, now_s = recovered(recover_frames=1)
+    logic.next_signal(now_s, State.SAFE)
+    logic.next_signal(now_s + 0.1, None, CAMERA)
+    assert logic.next_signal(now_s + 0.2, None).name == "FAULT"
+
+
+def test_a_held_alert_outlives_a_fault_only_by_its_hold() -> None:
+    logic, now_s = recovered(hold_alert_s=1.0)
+    logic.next_signal(now_s, State.ALERT)
+    during = logic.next_signal(now_s + 0.5, None, CAMERA)
+    assert (during.name, during.faults) == ("ALERT", CAMERA)
+    assert logic.next_signal(now_s + 1.0, None, CAMERA).name == "FAULT"
+
+
+def test_a_fresh_alert_shows_during_recovery_and_falls_back_to_fault() -> None:
+    logic = SignalLogic(recover_frames=50, hold_alert_s=1.0)
+    assert logic.next_signal(0.0, State.ALERT).name == "ALERT"
+    assert logic.next_signal(1.0, State.WARNING).name == "FAULT"
+
+
+def test_a_fresh_alert_shows_beside_a_fault_but_is_no_good_frame() -> None:
+    logic = SignalLogic(recover_frames=1, hold_alert_s=0.5)
+    assert logic.next_signal(0.0, State.ALERT, CAMERA).name == "ALERT"
+    assert logic.next_signal(0.6, None).name == "FAULT"
+
+
+@given(
+    steps=st.lists(
+        st.tuples(
+            st.floats(0, 0.4),
+            st.none() | st.sampled_from(State),
+            st.booleans(),
+        ),
+        max_size=60,
+    ),
+    hold_s=st.floats(0, 2),
+    recover=st.integers(1, 6),
+)
+@settings(deadline=None)
+def test_reassuring_colours_need_fresh_evidence(
+    steps: list[tuple[float, State | None, bool]], hold_s: float, recover: int
+) -> None:
+    logic = SignalLogic(hold_alert_s=hold_s, recover_frames=recover)
+    now_s, good = 0.0, 0
+    for pause_s, state, faulty in steps:
+        now_s += pause_s
+        signal = logic.next_signal(now_s, state, CAMERA if faulty else ())
+        good = 0 if faulty else good + (state is not None)
+        if signal.name in ("IDLE", "SAFE", "WARNING"):
+            assert not faulty
+            assert good >= recover
+            assert signal.blink_hz == 0
+        if signal.name == "FAULT":
+            assert (signal.colour, signal.sound) == (Colour.ORANGE, Sound.NONE)
+            assert signal.blink_hz > 0
+            assert signal.faults
+        if state is State.ALERT:
+            assert signal.name == "ALERT"
+
+
+@pytest.mark.parametrize("blink_hz", [0.0, -1.0, math.nan])
+def test_fault_and_alert_refuse_to_be_steady(blink_hz: float) -> None:
+    with pytest.raises(ValueError, match="must blink"):
+        fault_signal((), blink_hz)
+    with pytest.raises(ValueError, match="must blink"):
+        SignalLogic(blink_hz=blink_hz)
+
+
+class Oracle:
+    """What must show, from the whole history of calls: the rules, not the way they are coded."""
+
+    def __init__(self, recover_frames: int, hold_s: float) -> None:
+        self.recover_frames, self.hold_s = recover_frames, hold_s
+        self.calls: list[tuple[float, State | None, bool]] = []
+        self.before = "FAULT"
+
+    def name(self) -> str:
+        now_s, _, faulty = self.calls[-1]
+        alerts = [t for t, state, _ in self.calls if state is State.ALERT]
+        if alerts and (now_s == alerts[-1] or now_s - alerts[-1] < self.hold_s):
+            return "ALERT"
+        since = max((i + 1 for i, call in enumerate(self.calls) if call[2]), default=0)
+        good = [state for _, state, _ in self.calls[since:] if state is not None]
+        if faulty or len(good) < self.recover_frames:
+            return "FAULT"
+        return good[-1].name
+
+
+def test_all_states_and_inputs() -> None:
+    """Every input in every state that four calls reach: four states and a tick, with a fault and
+    without, within the hold of an ALERT and after it."""
+    recover, hold_s, reached = 2, 1.0, set()
+    inputs = list(itertools.product((None, *State), (False, True), (0.4, 1.5)))
+    colours = {
+        "IDLE": Colour.BLUE,
+        "SAFE": Colour.GREEN,
+        "WARNING": Colour.ORANGE,
+        "ALERT": Colour.RED,
+        "FAULT": Colour.ORANGE,
+    }
+
+    def walk(logic: SignalLogic, calls: list[tuple[float, State | None, bool]], shown: str) -> None:
+        for state, faulty, pause_s in inputs:
+            oracle = Oracle(recover, hold_s)
+            now_s = (calls[-1][0] if calls else 0.0) + pause_s
+            oracle.calls = [*calls, (now_s, state, faulty)]
+            after = copy.copy(logic)
+            signal = after.next_signal(now_s, state, CAMERA if faulty else ())
+            assert signal.name == oracle.name(), oracle.calls
+            assert signal.colour is colours[signal.name]
+            assert (signal.blink_hz > 0) == (signal.name in ("ALERT", "FAULT"))
+            assert not (faulty and signal.colour in (Colour.BLUE, Colour.GREEN))
+            chimes = signal.name == "SAFE" and shown != "SAFE"
+            bell = signal.name == "ALERT"
+            assert signal.sound is (Sound.CHIME if chimes else Sound.BELL if bell else Sound.NONE)
+            assert bool(signal.faults) == (signal.name == "FAULT" or faulty)
+            if faulty:
+                assert signal.faults == CAMERA
+            reached.add((shown, state, faulty, signal.name))
+            if len(calls) < 3:
+                walk(after, oracle.calls, signal.name)
+
+    walk(SignalLogic(recover_frames=recover, hold_alert_s=hold_s), [], "FAULT")
+    shown_before = {before for before, _, _, _ in reached}
+    assert shown_before == set(colours)
+    # From every shown state, every input was tried.
+    assert len({(b, s, f) for b, s, f, _ in reached}) == len(colours) * 5 * 2
+
+
+def test_every_pair_of_states_follows_at_once_outside_alert() -> None:
+    calm = [State.IDLE, State.SAFE, State.WARNING]
+    for first, second in itertools.permutations(calm, 2):
+        logic, now_s = recovered()
+        logic.next_signal(now_s, first)
+        assert logic.next_signal(now_s + FRAME_S, second).name == second.name
