@@ -1,4 +1,4 @@
-"""The decision frame by frame, with its reasons in words."""
+"""The decision, frame by frame, and its explanation in words."""
 
 from __future__ import annotations
 
@@ -6,24 +6,16 @@ import math
 
 import numpy as np
 
-from bikeped.decision.rules import PairChecks, RuleSettings, evaluate_rule
+from bikeped.decision.rules import EPSILON_M, PairChecks, RuleSettings, evaluate_rule
 from bikeped.decision.stages import is_remembered, resolve_state
 from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
-from bikeped.types import (
-    BoolArray,
-    Decision,
-    FloatArray,
-    IntArray,
-    KindArray,
-    PairMetrics,
-    State,
-)
+from bikeped.types import BoolArray, Decision, FloatArray, IntArray, KindArray, PairMetrics, State
 
 
 class Decider:
-    """Holds the last fraction of a second of positions and the cyclist memory.
+    """Keeps the last fraction of a second of positions and the time of the last cyclist.
 
-    `decide` once a frame, with the reported tracks in ascending id and times that increase.
+    Call `decide` once a frame, with the reported tracks in ascending id and increasing times.
     """
 
     def __init__(self, settings: RuleSettings) -> None:
@@ -32,10 +24,10 @@ class Decider:
         self._last_cyclist_s = -math.inf
 
     def decide(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> Decision:
-        """The decision at `time_s`; `ids` [n] ascending, `kind` [n], `xy_m` [n, 2]."""
+        """The decision at `time_s` (s); `ids` [n] ascending, `kind` [n], `xy_m` [n, 2] (m)."""
         rows, newest = self._buffer.append(time_s, ids, kind, xy_m)
         pairs = pair_rows(rows, self._buffer.frames, newest)
-        verdicts = evaluate_rule(rows, pairs, self.settings)
+        checks = evaluate_rule(rows, pairs, self.settings)
         if np.count_nonzero(kind == CYCLIST):
             self._last_cyclist_s = time_s
         pedestrians = np.count_nonzero(kind == PEDESTRIAN)
@@ -44,18 +36,18 @@ class Decider:
             is_remembered(
                 np.asarray([time_s]), np.asarray([self._last_cyclist_s]), self.settings.memory_s
             ),
-            np.asarray([np.count_nonzero(verdicts.fires) > 0]),
+            np.asarray([np.count_nonzero(checks.fires) > 0]),
         )
         state = State(code.item())
-        index = select_pair(state, verdicts.fires, verdicts.distance_m)
-        pair = None if index is None else pair_metrics(index, rows, pairs, verdicts, self.settings)
+        index = select_pair(state, checks.fires, checks.distance_m)
+        pair = None if index is None else pair_metrics(index, rows, pairs, checks, self.settings)
         sentence = explain(state, pair, pedestrians, time_s - self._last_cyclist_s, self.settings)
         return Decision(time_s, state, sentence, pair)
 
 
 def select_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int | None:
-    """Whom a frame's decision is about, of its pairs: the first in track order that fired (ALERT),
-    or the nearest (WARNING)."""
+    """Index of the pair that a frame's decision reports: the first in track order that fires
+    (ALERT), or the nearest (WARNING)."""
     if state is State.ALERT:
         return int(np.argmax(fires))
     if state is State.WARNING and len(distance_m):
@@ -64,19 +56,19 @@ def select_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int |
 
 
 def pair_metrics(
-    index: int, rows: TrackRows, pairs: Pairs, verdicts: PairChecks, settings: RuleSettings
+    index: int, rows: TrackRows, pairs: Pairs, checks: PairChecks, settings: RuleSettings
 ) -> PairMetrics:
-    """The figures by which pair `index` was judged."""
+    """The measurements of pair `index`."""
     return PairMetrics(
         cyclist_id=int(rows.id[pairs.cyclist_row[pairs.cyclist[index]]]),
         pedestrian_id=int(rows.id[pairs.pedestrian_row[index]]),
-        distance_m=float(verdicts.distance_m[index]),
-        distance_then_m=float(verdicts.distance_then_m[index]),
-        lookback_s=float(verdicts.lookback_s[index]),
-        displacement_m=float(verdicts.displacement_m[index]),
-        speed_mps=float(verdicts.speed_mps[index]),
+        distance_m=float(checks.distance_m[index]),
+        distance_then_m=float(checks.distance_then_m[index]),
+        lookback_s=float(checks.lookback_s[index]),
+        displacement_m=float(checks.displacement_m[index]),
+        speed_mps=float(checks.speed_mps[index]),
         d_min_m=settings.d_min_m,
-        d_max_m=float(verdicts.d_max_m[index]),
+        d_max_m=float(checks.d_max_m[index]),
     )
 
 
@@ -87,7 +79,7 @@ def explain(
     since_cyclist_s: float,
     settings: RuleSettings,
 ) -> str:
-    """One line that a resident can read, with the numbers that made the decision."""
+    """The decision and its numbers in one line for a resident."""
     if state is State.IDLE:
         return "IDLE: no pedestrian is tracked."
     people = "1 pedestrian is" if pedestrians == 1 else f"{pedestrians} pedestrians are"
@@ -100,23 +92,22 @@ def explain(
             f"WARNING: {people} tracked and a cyclist was {since_cyclist_s:.1f} s ago; "
             "none is there now."
         )
-    who = f"cyclist {pair.cyclist_id} and pedestrian {pair.pedestrian_id}"
+    pair_text = f"cyclist {pair.cyclist_id} and pedestrian {pair.pedestrian_id}"
     gap = f"{pair.distance_m:.2f} m apart"
-    then = f"{pair.distance_then_m:.2f} m {pair.lookback_s:.2f} s ago"
+    past = f"were {pair.distance_then_m:.2f} m {pair.lookback_s:.2f} s ago"
     if state is State.ALERT:
         moved = f"the cyclist moved {pair.displacement_m:.2f} m at {pair.speed_mps:.1f} m/s"
         bounds = f"{pair.d_min_m:g} to {pair.d_max_m:.1f} m"
         if settings.rule == "distance":
-            return f"ALERT: {who} are {gap}, within {bounds} (rule distance)."
+            return f"ALERT: {pair_text} are {gap}, within {bounds} (rule distance)."
         return (
-            f"ALERT: {who} are {gap}, were {then}; {moved}; alerts within {bounds} "
+            f"ALERT: {pair_text} are {gap}, {past}; {moved}; alerts within {bounds} "
             f"(rule {settings.rule})."
         )
-    return f"WARNING: {who} are {gap}, {_why_not(pair, settings)}."
+    return f"WARNING: {pair_text} are {gap}, {_reason_not_to_alert(pair, past, settings)}."
 
 
-def _why_not(pair: PairMetrics, settings: RuleSettings) -> str:
-    """Why the nearest pair does not alert."""
+def _reason_not_to_alert(pair: PairMetrics, past: str, settings: RuleSettings) -> str:
     if pair.distance_m < pair.d_min_m:
         return f"nearer than the {pair.d_min_m:g} m at which a warning still helps"
     if pair.distance_m > pair.d_max_m:
@@ -124,9 +115,9 @@ def _why_not(pair: PairMetrics, settings: RuleSettings) -> str:
     if pair.lookback_s <= 0:
         return f"just appeared, or more than {settings.max_range_m:g} m from the camera"
     if settings.rule == "ttc":
-        return f"were {pair.distance_then_m:.2f} m {pair.lookback_s:.2f} s ago: not soon together"
-    if pair.distance_m >= pair.distance_then_m - 1e-9:
-        return f"were {pair.distance_then_m:.2f} m {pair.lookback_s:.2f} s ago: not closing"
+        return f"{past}: not soon together"
+    if pair.distance_m >= pair.distance_then_m - EPSILON_M:
+        return f"{past}: not closing"
     return (
         f"closing, but the cyclist moved only {pair.displacement_m:.2f} m in "
         f"{pair.lookback_s:.2f} s"

@@ -1,9 +1,9 @@
 """The closing checks (definitions, section 8), over any number of pairs at once.
 
-Each rule looks at a pair now and `lookback_s` ago. A dropped frame must not change what that
-means: where no frame lies exactly that far back, the positions are interpolated between the two
-that surround it. A pair younger than the lookback is judged over the time that it has; a pair
-without an earlier position is not judged.
+Each rule compares a pair now with the same pair `lookback_s` ago. Where no frame lies exactly that
+far back, for example because one was dropped, positions are interpolated between the two frames
+around it. A pair younger than the lookback is compared over its life so far; a pair without an
+earlier position is not evaluated.
 """
 
 from __future__ import annotations
@@ -76,12 +76,12 @@ class PairChecks:
 def stopping_distance(
     speed_mps: FloatArray, reaction_s: float, deceleration_mps2: float
 ) -> FloatArray:
-    """Metres to stand: v t + v^2 / 2a (paper, section 4.2)."""
+    """Stopping distance in metres: v t + v^2 / 2a (paper, section 4.2)."""
     return speed_mps * reaction_s + speed_mps * speed_mps / (2 * deceleration_mps2)
 
 
 def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairChecks:
-    """Applies the rule to every pair."""
+    """Applies the rule `settings.rule` to every pair [m]."""
     cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist], pairs.pedestrian_row
     c_now, p_now = rows.xy_m[cyclist], rows.xy_m[pedestrian]
     distance = _length(c_now - p_now)
@@ -93,22 +93,22 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
         )
     above_d_min, below_d_max = distance >= settings.d_min_m, distance <= d_max
     in_range = (_length(c_now) <= settings.max_range_m) & (_length(p_now) <= settings.max_range_m)
-    near = above_d_min & below_d_max & in_range
     # Only these are looked up in the past: of thousands of pairs in a crowd few are within bounds.
-    index = near.nonzero()[0]
-    c_then, p_then, elapsed = _look_back(
+    index = (above_d_min & below_d_max & in_range).nonzero()[0]
+    c_past, p_past, elapsed = _positions_before(
         rows, cyclist[index], pedestrian[index], settings.lookback_s
     )
-    closes, passes, then, displacement = _close_in(
-        settings, distance[index], c_now[index], p_now[index], c_then, p_then, elapsed
+    is_closing, second_check, past_distance, moved = _compare(
+        settings, distance[index], c_now[index], p_now[index], c_past, p_past, elapsed
     )
 
     count = len(pairs)
-    distance_then, lookback, way = distance.copy(), np.zeros(count), np.zeros(count)
-    distance_then[index], lookback[index], way[index] = then, elapsed, displacement
+    distance_then, lookback, displacement = distance.copy(), np.zeros(count), np.zeros(count)
+    distance_then[index], lookback[index], displacement[index] = past_distance, elapsed, moved
     evaluated = lookback > 0
     closing, displacement_ok = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-    closing[index], displacement_ok[index] = closes & evaluated[index], passes & evaluated[index]
+    closing[index] = is_closing & evaluated[index]
+    displacement_ok[index] = second_check & evaluated[index]
     return PairChecks(
         fires=closing & displacement_ok,
         evaluated=evaluated,
@@ -120,36 +120,36 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
         distance_m=distance,
         distance_then_m=distance_then,
         lookback_s=lookback,
-        displacement_m=way,
+        displacement_m=displacement,
         speed_mps=speed,
         d_max_m=d_max,
     )
 
 
-def _close_in(
+def _compare(
     settings: RuleSettings,
     distance: FloatArray,
     c_now: FloatArray,
     p_now: FloatArray,
-    c_then: FloatArray,
-    p_then: FloatArray,
+    c_past: FloatArray,
+    p_past: FloatArray,
     elapsed: FloatArray,
 ) -> tuple[BoolArray, BoolArray, FloatArray, FloatArray]:
-    """The rule itself: which pairs close in, which pass its second test (they fire when they do
-    both), the old distance it compared with, the cyclist's way."""
-    then = _length(c_then - p_then)
-    displacement = _length(c_now - c_then)
+    """The rule itself, for pairs [k]: `closing`, `displacement_ok` (a pair that passes both fires),
+    the past distance it compared with, and the cyclist's displacement."""
+    past_distance = _length(c_past - p_past)
+    displacement = _length(c_now - c_past)
     if settings.rule == "distance":
         always = np.ones(len(distance), np.bool_)
-        return always, always, then, displacement
+        return always, always, past_distance, displacement
     if settings.rule == "ttc":
-        closing = (then - distance) / np.maximum(elapsed, EPSILON_S)
-        soon = distance < settings.ttc_s * closing
-        return closing > TTC_CLOSING_MIN_MPS, soon, then, displacement
+        closing_mps = (past_distance - distance) / np.maximum(elapsed, EPSILON_S)
+        soon = distance < settings.ttc_s * closing_mps
+        return closing_mps > TTC_CLOSING_MIN_MPS, soon, past_distance, displacement
     if settings.rule == "naive":
-        then = _length(c_then - p_now)  # the pedestrian's old position is left out: its flaw
-    closer = distance < then - EPSILON_M
-    return closer, displacement > settings.min_displacement_m, then, displacement
+        past_distance = _length(c_past - p_now)  # its flaw: the pedestrian counts as standing
+    closing = distance < past_distance - EPSILON_M
+    return closing, displacement > settings.min_displacement_m, past_distance, displacement
 
 
 def _length(vector: FloatArray) -> FloatArray:
@@ -157,10 +157,11 @@ def _length(vector: FloatArray) -> FloatArray:
     return np.sqrt(x * x + y * y)
 
 
-def _look_back(
+def _positions_before(
     rows: TrackRows, cyclist: IndexArray, pedestrian: IndexArray, lookback_s: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Both agents' positions [m, 2] `lookback_s` ago (or as far back as both go), and how long."""
+    """Positions [m, 2] of cyclist and pedestrian `lookback_s` before their rows, or as far back as
+    both tracks reach, and the time [m] between, seconds."""
     now = rows.time_s[cyclist]
     target = now - (lookback_s - EPSILON_S)
     c_old, p_old = cyclist, pedestrian
@@ -175,21 +176,21 @@ def _look_back(
             break
         c_new, p_new = np.where(go, c_old, c_new), np.where(go, p_old, p_new)
         c_old, p_old = np.where(go, c_prev, c_old), np.where(go, p_prev, p_old)
-    c_then, p_then = rows.xy_m[c_old], rows.xy_m[p_old]
+    c_past, p_past = rows.xy_m[c_old], rows.xy_m[p_old]
     old_s = rows.time_s[c_old]
     overshoot = now - lookback_s - old_s
     between = overshoot > EPSILON_S
     if np.count_nonzero(between):
         gap = np.where(between, rows.time_s[c_new] - old_s, 1.0)
-        part = np.where(between, overshoot / gap, 0.0)[:, None]
-        c_then = c_then + part * (rows.xy_m[c_new] - c_then)
-        p_then = p_then + part * (rows.xy_m[p_new] - p_then)
+        share = np.where(between, overshoot / gap, 0.0)[:, None]
+        c_past = c_past + share * (rows.xy_m[c_new] - c_past)
+        p_past = p_past + share * (rows.xy_m[p_new] - p_past)
         old_s = np.where(between, now - lookback_s, old_s)
-    return c_then, p_then, now - old_s
+    return c_past, p_past, now - old_s
 
 
 def _speed(rows: TrackRows, row: IndexArray, window_s: float) -> FloatArray:
-    """Speed [n] over the last positions that span `window_s`, or over those that there are."""
+    """Speeds [n] (m/s) over the last `window_s`, or over the track's life where it is shorter."""
     now = rows.time_s[row]
     target = now - (window_s - EPSILON_S)
     old = row
@@ -203,5 +204,5 @@ def _speed(rows: TrackRows, row: IndexArray, window_s: float) -> FloatArray:
             break
         old = np.where(go, previous, old)
     elapsed = now - rows.time_s[old]
-    way = _length(rows.xy_m[row] - rows.xy_m[old])
-    return np.where(elapsed > 0, way / np.maximum(elapsed, EPSILON_S), 0.0)
+    displacement = _length(rows.xy_m[row] - rows.xy_m[old])
+    return np.where(elapsed > 0, displacement / np.maximum(elapsed, EPSILON_S), 0.0)

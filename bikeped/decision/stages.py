@@ -1,4 +1,4 @@
-"""The three stages (paper, algorithm 1): who is there, who was there, who is approaching."""
+"""The three stages (paper, algorithm 1): pedestrian present, cyclist remembered, approaching."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def resolve_state(
 
 
 def is_remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:
-    """Whether a cyclist was tracked within the memory; a memory of 0 s means now."""
+    """[n]: whether a cyclist was tracked within the last `memory_s`; 0 s means in this frame."""
     return np.asarray(now_s - last_cyclist_s <= memory_s + _EPSILON_S)
 
 
 def frame_mask(frame: IndexArray, frames: int) -> BoolArray:
-    """[frames]: which of them are named in `frame`."""
+    """[frames]: true at the indices in `frame`."""
     out = np.zeros(frames, np.bool_)
     out[frame] = True
     return out

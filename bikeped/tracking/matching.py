@@ -1,10 +1,10 @@
 """Greedy nearest-neighbour matching, vectorised and exact.
 
-Greedy and not optimal (Hungarian): a resident can follow "nearest first" with a finger on the
-plan, and the paper's tracker does it. The exact order is: all allowed pairs sorted by distance
-(ties: lower track, then lower detection), each taken if both are still free. A pair that is the
-nearest of its track *and* of its detection is taken by that order whatever the others do, so all
-such pairs are taken at once, and the rest is looked at again: a few rounds instead of a loop.
+Greedy and not optimal (Hungarian), as in the paper: a resident can follow "nearest first" on a
+plan. The order is: all allowed pairs sorted by distance (ties: lower track, then lower detection),
+each taken if both are still free. A pair that is the nearest of its track *and* of its detection is
+taken by that order in any case, so all such pairs are taken at once, and the rest in the next
+round: a few rounds instead of a loop over pairs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The pole's tracker: one lane, with position history and windowed velocity."""
+"""The device's tracker: a batch of one scene, with position history and windowed velocity."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _EPSILON_S = 1e-6
 class Tracker:
     """`update(points, time_s)` once a frame gives the tracks.
 
-    The velocity reported is the displacement over `speed_window_s` (the paper: positions 4 frames
-    apart over the elapsed time), or over the track's life while it is shorter; the smoothed
-    velocity that coasting and prediction use is in `lanes`.
+    The velocity reported is the displacement over `speed_window_s` (paper: positions 4 frames apart
+    over the elapsed time), or over the track's life while it is shorter; the smoothed
+    velocity that coasting and prediction use is that of `batch`.
     """
 
     def __init__(
@@ -27,44 +27,44 @@ class Tracker:
         speed_window_s: float = 4 / 30,
         history_length: int = 30,
     ) -> None:
-        self.lanes = BatchTracker(settings)
+        self.batch = BatchTracker(settings)
         self._speed_window_s = speed_window_s
         self._paths: dict[int, deque[tuple[float, float, float]]] = {}
         self._history_length = history_length
 
     def update(self, points: GroundPoints, time_s: float) -> Tracks:
-        """Tracks at `time_s` seconds after the detections `points` of that moment."""
-        lanes = self.lanes
-        lanes.update(time_s, points.xy_m[None], points.kind[None])
-        slot = lanes.reported[0].nonzero()[0]
-        slot = slot[lanes.id[0][slot].argsort(kind="stable")]
-        ids = lanes.id[0][slot]
-        xy = lanes.xy_m[0][slot]
-        velocity = self._remember(ids.tolist(), xy, time_s)
-        matched = lanes.detection[0][slot]
+        """Tracks at `time_s` (seconds), updated with that frame's ground points."""
+        batch = self.batch
+        batch.update(time_s, points.xy_m[None], points.kind[None])
+        slot = batch.reported[0].nonzero()[0]
+        slot = slot[batch.id[0][slot].argsort(kind="stable")]
+        ids = batch.id[0][slot]
+        xy = batch.xy_m[0][slot]
+        velocity = self._window_velocity(ids.tolist(), xy, time_s)
+        matched = batch.detection[0][slot]
         # Index -1 reads the last detection; the extra -1 at the end makes that "none".
         detection = np.append(points.detection, -1)[matched]
         self._slot = slot
         return Tracks(
             time_s=time_s,
             id=ids,
-            kind=lanes.kind[0][slot],
+            kind=batch.kind[0][slot],
             xy_m=xy,
             velocity_mps=velocity,
-            unseen_s=np.maximum(time_s - lanes.seen_s[0][slot], 0.0),
+            unseen_s=np.maximum(time_s - batch.seen_s[0][slot], 0.0),
             detection=detection,
         )
 
     def smoothed(self) -> tuple[FloatArray, FloatArray]:
-        """Smoothed velocity and acceleration [n, 2] of the tracks of the last update."""
+        """Smoothed velocity (m/s) and acceleration (m/s^2) [n, 2] of the last update's tracks."""
         slot = self._slot
-        return self.lanes.velocity_mps[0][slot], self.lanes.acceleration_mps2[0][slot]
+        return self.batch.velocity_mps[0][slot], self.batch.acceleration_mps2[0][slot]
 
     def history(self) -> Mapping[int, list[list[float]]]:
-        """Positions [x, y] of every present track, oldest first."""
+        """Positions [x, y] (m) of every present track by id, oldest first."""
         return {key: [[x, y] for _, x, y in path] for key, path in self._paths.items()}
 
-    def _remember(self, ids: list[int], xy: FloatArray, time_s: float) -> FloatArray:
+    def _window_velocity(self, ids: list[int], xy: FloatArray, time_s: float) -> FloatArray:
         known = self._paths
         self._paths = {}
         velocity = []
@@ -73,11 +73,11 @@ class Tracker:
             path = known.get(key)
             if path is None:
                 path = deque(maxlen=self._history_length)
-            then, px, py = time_s, x, y
-            for then, px, py in reversed(path):  # noqa: B007  the last one looked at is used below
-                if then <= target:
+            past_s, px, py = time_s, x, y
+            for past_s, px, py in reversed(path):  # noqa: B007 - used below
+                if past_s <= target:
                     break
-            elapsed = time_s - then
+            elapsed = time_s - past_s
             velocity.append(((x - px) / elapsed, (y - py) / elapsed) if elapsed > 0 else (0.0, 0.0))
             path.append((time_s, x, y))
             self._paths[key] = path

@@ -114,7 +114,7 @@ def test_only_a_moment_of_the_past_is_held():
     decider = Decider(SELECTED)
     for i in range(5000):
         step(decider, i / 30, {1: (PEDESTRIAN, 0.0, 0.0)})
-    assert len(decider._buffer._frame) <= 512
+    assert len(decider._buffer._rows) <= 512
     assert decider._buffer.frames <= 512
 
 

@@ -174,7 +174,7 @@ async def test_a_save_is_told_and_a_stale_one_refused(place: Path, start) -> Non
     assert load_config(place).config.camera.pitch_deg == -5
     again = await client.post("/align/save", json=ask)
     assert again.status == 409
-    assert "somebody else" in (await again.json())["error"]
+    assert "changed after this page" in (await again.json())["error"]
     state = await (await client.get("/align/state")).json()
     assert state["filed"]["pitch_deg"] == -5
     assert state["running"]["pitch_deg"] == 0
@@ -205,7 +205,7 @@ async def test_questions_that_cannot_be(place: Path, start) -> None:
         ("grid", {**grid, "decision": {}}, "decision"),
         ("grid", {**grid, "marks": [{"name": "1", "u": 1, "v": 1}] * 41}, "marks"),
         ("fit", {"frame": FRAME, "marks": "no"}, "marks"),
-        ("save", {"values": {"pitch_deg": 91}, "sha256": "?"}, "somebody else"),
+        ("save", {"values": {"pitch_deg": 91}, "sha256": "?"}, "changed after this page"),
     ):
         answer = await client.post(f"/align/{path}", json=ask)
         assert answer.status in (400, 409), (path, ask)

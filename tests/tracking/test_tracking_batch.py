@@ -1,4 +1,4 @@
-"""The life of a track, step by step, and lanes side by side."""
+"""The life of a track, step by step, and independent scenes in one batch."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ POLE = TrackerSettings(
 
 
 def feed(tracker, t, *points, kind=PEDESTRIAN):
-    """One lane, one frame; `points` are (x, y) or (x, y, kind)."""
+    """One scene, one frame; `points` are (x, y) or (x, y, kind)."""
     xy = np.array([p[:2] for p in points], np.float64).reshape(1, -1, 2)
     kinds = np.array([[p[2] if len(p) > 2 else kind for p in points]], np.int8)
     tracker.update(t, xy, kinds.reshape(1, -1))
@@ -296,31 +296,31 @@ def test_ten_people_of_whom_a_quarter_is_missed_never_become_eleven(spacing, lay
         assert most == 10
 
 
-# ---- lanes
+# ---- batch
 
 
 @pytest.mark.parametrize("settings", [POLE, TrackerSettings()])
 def test_lanes_together_equal_each_alone(settings):
     rng = np.random.default_rng(3)
-    lanes, places = 5, 12
-    together = BatchTracker(settings, lanes, slots=2)
-    alone = [BatchTracker(settings, 1, slots=2) for _ in range(lanes)]
-    home = rng.uniform(-10, 10, (lanes, places, 2))
-    kind_of = rng.integers(0, 3, (lanes, places)).astype(np.int8)
+    scenes, places = 5, 12
+    together = BatchTracker(settings, scenes, slots=2)
+    alone = [BatchTracker(settings, 1, slots=2) for _ in range(scenes)]
+    home = rng.uniform(-10, 10, (scenes, places, 2))
+    kind_of = rng.integers(0, 3, (scenes, places)).astype(np.int8)
     for frame in range(80):
         xy = home + rng.normal(0, 0.15, home.shape) + np.array([0.03, 0.02]) * frame
-        here = rng.random((lanes, places)) < np.array([0.2, 0.5, 0.7, 0.9, 1.0])[:, None]
+        here = rng.random((scenes, places)) < np.array([0.2, 0.5, 0.7, 0.9, 1.0])[:, None]
         kind = np.where(here, kind_of, -1).astype(np.int8)
         xy[~here] = np.where(rng.random(2) < 0.5, np.nan, 3.0)  # empty places hold anything
         together.update(frame / 30, xy, kind)
-        for lane, single in enumerate(alone):
-            single.update(frame / 30, xy[lane : lane + 1], kind[lane : lane + 1])
+        for scene, single in enumerate(alone):
+            single.update(frame / 30, xy[scene : scene + 1], kind[scene : scene + 1])
             slots = single.alive.shape[1]
-            assert not together.alive[lane, slots:].any()
-            a, b = together.alive[lane, :slots], single.alive[0]
+            assert not together.alive[scene, slots:].any()
+            a, b = together.alive[scene, :slots], single.alive[0]
             assert (a == b).all()
             for name in ("id", "kind", "xy_m", "velocity_mps", "acceleration_mps2", "seen_s",
                          "hits", "detection"):  # fmt: skip
-                left, right = getattr(together, name)[lane, :slots], getattr(single, name)[0]
-                assert (left[a] == right[b]).all(), (frame, lane, name)
+                left, right = getattr(together, name)[scene, :slots], getattr(single, name)[0]
+                assert (left[a] == right[b]).all(), (frame, scene, name)
     assert together.id.max() > 12
