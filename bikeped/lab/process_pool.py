@@ -12,12 +12,14 @@ import functools
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from typing import ParamSpec, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from typing import Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 T = TypeVar("T")
+#: Called with the number of finished steps.
+ProgressCallback = Callable[[int], None]
 
 #: Environment that keeps numerical libraries on one core.
 _ONE_THREAD = (
@@ -61,8 +63,34 @@ def worker_pool(processes: int) -> Iterator[WorkerPool]:
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
 
 
+def no_progress(done: int) -> None:
+    """A ProgressCallback that does nothing."""
+
+
+def run_jobs(
+    job: Callable[P, T],
+    arguments: Sequence[tuple[Any, ...]],
+    processes: int = 1,
+    progress: ProgressCallback = no_progress,
+) -> list[T]:
+    """`job(*a)` for each `a` of `arguments`, in their order; started in that order, in `processes`
+    processes (one: in this process)."""
+    if processes == 1 or len(arguments) < 2:
+        results = []
+        for given in arguments:
+            results.append(job(*given))  # type: ignore[call-arg]
+            progress(len(results))
+        return results
+    with worker_pool(min(processes, len(arguments))) as pool:
+        futures = [pool.submit(job, *given) for given in arguments]  # type: ignore[call-arg]
+        for count, future in enumerate(as_completed(futures), 1):
+            future.result()  # an error ends the whole
+            progress(count)
+        return [future.result() for future in futures]
+
+
 class _State:
-    """Of one worker process."""
+    """State of one worker process."""
 
     busy = False
     interrupted = False

@@ -1,17 +1,16 @@
-"""`bikeped conformance pixels`: the suite drawn and run through the deployed loop."""
+"""`bikeped conformance pixels`: the suite rendered and run through the deployed loop."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from bikeped.cli.common import console, progress_bar, width_height
-from bikeped.cli.guard import guarded
-from bikeped.cores import cores
+from bikeped.cli.common import progress_bar, width_height
 from bikeped.errors import BikepedError, require
 from bikeped.files import make_folder
-from bikeped.lab.cli.conformance_shared import begin, emit, processes_option, suite_options
+from bikeped.lab.cli.conformance_shared import SuiteRun, experiment_options, processes_option
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -22,9 +21,9 @@ def _size(text: str) -> tuple[int, int]:
 
 
 @click.command("pixels")
-@suite_options
+@experiment_options
 @click.option("--scenario", "names", multiple=True, metavar="NAME", help="Only this one; repeat.")
-@click.option("--size", default="1920x1080", show_default=True, help="Of the pictures.")
+@click.option("--size", default="1920x1080", show_default=True, help="Size of the rendered frames.")
 @click.option(
     "--light",
     type=click.Choice(["day", "overcast", "dusk", "night", "glare"]),
@@ -41,28 +40,21 @@ def _size(text: str) -> tuple[int, int]:
     help="Draw stages, recall and localisation error: pixels.png and pixels.pdf in this folder.",
 )
 @processes_option
-@guarded
 def command(
-    config_path: Path | None,
-    overrides: tuple[str, ...],
-    scenarios_dir: Path | None,
-    seed: int | None,
-    json_path: str | None,
+    run: SuiteRun,
     names: tuple[str, ...],
     size: str,
     light: str,
     weather: str,
     place: int,
     figures: Path | None,
-    processes: int | None,
+    processes: int,
 ) -> None:
-    """All scenarios drawn, detected, projected, tracked and decided by the deployed loop, against
-    the truth; what is lost against the scripted run is named by stage.
+    """End-to-end simulation: all scenarios rendered as video, detected, projected, tracked and
+    decided by the deployed loop, against ground truth. An ablation says which stage loses what.
 
-    Without a configured detector the bundled one looks.
+    Without a configured detector the bundled one is used.
     """
-    from dataclasses import replace
-
     from bikeped.lab.endtoend.ablation import run_ablation
     from bikeped.lab.endtoend.measures import collect_observations
     from bikeped.lab.endtoend.report import DrawingSettings, end_to_end_result, verdict
@@ -75,30 +67,26 @@ def command(
         require("matplotlib")
         make_folder(figures, "--figures")
     # One thread each: the processes share the cores. A --set that is given comes later and wins.
-    overrides = ("detection.threads=1", *overrides)
-    loaded, suite = begin(config_path, overrides, scenarios_dir)
-    if loaded.config.detection.model is None:
-        loaded, suite = begin(config_path, ("detection.model=bundled", *overrides), scenarios_dir)
+    run = replace(run, overrides=("detection.threads=1", *run.overrides))
+    if run.loaded.config.detection.model is None:
+        run = replace(run, overrides=("detection.model=bundled", *run.overrides))
     if names:
         if len(set(names)) < len(names):
             raise BikepedError("--scenario: names a scenario twice, which would count it twice")
-        suite = replace(
-            suite, scenarios=tuple(s for n in names for s in select_scenario(suite, n).scenarios)
-        )
-    conditions = Conditions(seed=seed or 0, light=light, weather=weather, place=place)
+        chosen = (select_scenario(run.suite, name).scenarios for name in names)
+        run.suite = replace(run.suite, scenarios=tuple(s for part in chosen for s in part))
+    suite, loaded = run.suite, run.loaded
+    conditions = Conditions(seed=run.seed, light=light, weather=weather, place=place)
     with progress_bar("scenarios", len(suite.scenarios)) as progress:
-        runs = run_all(
-            loaded, suite.scenarios, conditions, (width, height), processes or cores(), progress
-        )
-    rungs = run_ablation(suite, runs, loaded, loaded.config.decision)
-    drawing = DrawingSettings(width, height, light, weather, place, seed or 0)
-    result = end_to_end_result(
-        suite, runs, rungs, collect_observations(runs, suite.perception_results, loaded), drawing
-    )
+        runs = run_all(loaded, suite.scenarios, conditions, (width, height), processes, progress)
+    steps = run_ablation(suite, runs, loaded, run.decision)
+    drawing = DrawingSettings(width, height, light, weather, place, run.seed)
+    observations = collect_observations(runs, suite.perception_results, loaded)
+    result = end_to_end_result(suite, runs, steps, observations, drawing)
     if figures is not None:
         from bikeped.lab.endtoend.figure import draw_pixels
 
         draw_pixels(result.data, figures)
-    emit(result, suite, loaded, seed or 0, json_path)
-    if json_path != "-":
-        console(json_path).print(verdict(rungs))
+    run.emit(result)
+    if run.json_path != "-":
+        run.console.print(verdict(steps))

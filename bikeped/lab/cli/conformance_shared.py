@@ -1,8 +1,11 @@
-"""What the conformance commands share: options, the suite, tables and JSON."""
+"""What the conformance commands share: options, configuration and suite, tables and JSON."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -12,13 +15,16 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from bikeped.cli.common import FiniteRange, config_options, console, json_option, write_json
-from bikeped.config import LoadedConfig, load_config
+from bikeped.cli.guard import guarded
+from bikeped.config import DecisionConfig, LoadedConfig, load_config
+from bikeped.cores import cores
 
 if TYPE_CHECKING:
     from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
     from bikeped.lab.simulation.suite import Suite
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
 
 def scenarios_option(command: F) -> F:
@@ -28,24 +34,96 @@ def scenarios_option(command: F) -> F:
         "scenarios_dir",
         type=click.Path(path_type=Path),
         metavar="DIR",
-        help="Folder of scenario files in place of the bundled ones.",
+        help="Folder of scenario files (*.yaml) in place of the bundled 24.",
     )(command)
 
 
-def suite_options(function: F) -> F:
-    """`-c`, `--set`, `--scenarios`, `--seed` and `--json`, on every experiment."""
-    for option in (
-        json_option,
-        click.option(
-            "--seed",
-            type=click.IntRange(0, 2**32 - 1),
-            help="Seed of everything random; it is told in the JSON. Default: 0; optimize: 42.",
-        ),
-        scenarios_option,
-        config_options,
-    ):
-        function = option(function)
-    return function
+@dataclass
+class SuiteRun:
+    """The options that all conformance commands share; configuration and suite on first use.
+
+    So a command checks its own options before anything is loaded.
+    """
+
+    config_path: Path | None
+    overrides: tuple[str, ...]
+    scenarios_dir: Path | None
+    json_path: str | None
+    seed_option: int | None = None
+
+    @property
+    def seed(self) -> int:
+        return self.seed_option or 0
+
+    @cached_property
+    def loaded(self) -> LoadedConfig:
+        return load_config(self.config_path, self.overrides)
+
+    @cached_property
+    def suite(self) -> Suite:
+        """The scenarios of the folder (None: the bundled ones) before the configured camera."""
+        from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+        from bikeped.lab.simulation.suite import Suite
+
+        return Suite.load(load_scenarios(self.scenarios_dir or bundled_folder()), self.loaded)
+
+    @property
+    def decision(self) -> DecisionConfig:
+        return self.loaded.config.decision
+
+    @cached_property
+    def console(self) -> Console:
+        return console(self.json_path)
+
+    def write_json(self, data: dict[str, Any]) -> None:
+        """Writes `data` where `--json` says; nothing without it."""
+        if self.json_path is not None:
+            write_json(data, self.json_path)
+
+    def provenance(self, seed: int | None = None) -> dict[str, Any]:
+        """The keys that every experiment's JSON begins with."""
+        from bikeped.lab.experiments.deterministic import result_provenance
+
+        return result_provenance(self.suite, self.loaded, self.seed if seed is None else seed)
+
+    def emit(self, result: ExperimentResult, seed: int | None = None) -> None:
+        """The result as JSON where it is asked for, and as tables unless JSON goes to stdout."""
+        if self.json_path is not None:
+            self.write_json({**self.provenance(seed), **result.data})
+        if self.json_path != "-":
+            for table in result.tables:
+                print_table(self.console, table)
+                self.console.print()
+
+
+def suite_options(function: Callable[..., T]) -> Callable[..., T]:
+    """`-c`, `--set`, `--scenarios` and `--json`, which the function gets as a `SuiteRun`.
+
+    Its files are checked before it starts (`cli.guard`).
+    """
+
+    @functools.wraps(function)
+    def with_run(
+        config_path: Path | None,
+        overrides: tuple[str, ...],
+        scenarios_dir: Path | None,
+        json_path: str | None,
+        seed: int | None = None,
+        **options: Any,
+    ) -> T:
+        run = SuiteRun(config_path, overrides, scenarios_dir, json_path, seed)
+        return function(run, **options)
+
+    return config_options(scenarios_option(json_option(guarded(with_run))))
+
+
+def experiment_options(function: Callable[..., T]) -> Callable[..., T]:
+    """`suite_options` and `--seed`."""
+    return click.option(
+        "--seed",
+        type=click.IntRange(0, 2**32 - 1),
+        help="Seed of all random numbers; the JSON records it. Default: 0; optimize: 42.",
+    )(suite_options(function))
 
 
 def trials_option(default: int) -> Callable[[F], F]:
@@ -55,28 +133,29 @@ def trials_option(default: int) -> Callable[[F], F]:
         type=click.IntRange(1, 100_000),
         default=default,
         show_default=True,
-        help="Random repetitions.",
+        help="Number of random trials.",
     )
 
 
 processes_option = click.option(
     "--processes",
     type=click.IntRange(1, 256),
-    help="Processes; default: one a core. The figures do not depend on it.",
+    callback=lambda ctx, param, value: value or cores(),
+    help="Number of processes; default: one a core. Results do not depend on it.",
 )
 curve_option = click.option(
     "--recall-curve",
     "curve_path",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Recall over projected area: CSV or JSON of bin centre (square pixels), recall.",
+    help="Detector recall by projected area: CSV or JSON of bin centre (square pixels), recall.",
 )
 burst_option = click.option(
     "--burst",
     type=FiniteRange(1, 1000),
     default=5.0,
     show_default=True,
-    help="Mean length of a burst of misses, in frames.",
+    help="Mean length of a burst of missed detections, in frames.",
 )
 
 
@@ -112,42 +191,3 @@ def cell_text(cell: CellValue, column: str) -> str:
     if isinstance(cell, float) and column.endswith(", s"):
         return f"{cell:.2f}"
     return f"{cell:g}" if isinstance(cell, float) else escape(str(cell))
-
-
-def begin(
-    config_path: Path | None,
-    overrides: tuple[str, ...],
-    scenarios_dir: Path | None,
-) -> tuple[LoadedConfig, Suite]:
-    """Configuration and suite, and every quick check before the work."""
-    loaded = load_config(config_path, overrides)
-    return loaded, load_suite(loaded, scenarios_dir)
-
-
-def load_suite(loaded: LoadedConfig, scenarios_dir: Path | None) -> Suite:
-    """The scenarios of a folder (None: the bundled ones) before the configured camera."""
-    from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
-    from bikeped.lab.simulation.suite import Suite
-
-    return Suite.load(load_scenarios(scenarios_dir or bundled_folder()), loaded)
-
-
-def emit(
-    result: ExperimentResult, suite: Suite, loaded: LoadedConfig, seed: int, json_path: str | None
-) -> None:
-    """JSON where it is asked for, tables for people unless standard output is JSON's."""
-    if json_path is not None:
-        write_json({**stamp(suite, loaded, seed), **result.data}, json_path)
-    if json_path == "-":
-        return
-    screen = console()
-    for table in result.tables:
-        print_table(screen, table)
-        screen.print()
-
-
-def stamp(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
-    """What every JSON begins with: where its figures come from."""
-    from bikeped.lab.experiments.deterministic import result_provenance
-
-    return result_provenance(suite, loaded, seed)

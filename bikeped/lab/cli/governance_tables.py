@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
-
-from bikeped.cli.common import console
 
 if TYPE_CHECKING:
     from bikeped.lab.governance.gates import Gate
@@ -18,7 +17,7 @@ def count(scenarios: int) -> str:
     return f"{scenarios} scenario{'' if scenarios == 1 else 's'}"
 
 
-def print_gates(title: str, gates: list[Gate], json_path: str | None) -> None:
+def print_gates(title: str, gates: list[Gate], out: Console) -> None:
     """Required and measured, and in one line what fails."""
     table = RichTable(title=escape(title), title_justify="left")
     for column in ("Gate", "Required", "Measured", "Holds"):
@@ -27,7 +26,6 @@ def print_gates(title: str, gates: list[Gate], json_path: str | None) -> None:
         table.add_row(
             g.name, g.rule, g.format_value(g.measured), "yes" if g.holds else "[bold]NO[/bold]"
         )
-    out = console(json_path)
     out.print(table)
     failed = [
         f"{g.name.lower()} {g.format_value(g.measured)}, required {g.rule}"
@@ -37,9 +35,8 @@ def print_gates(title: str, gates: list[Gate], json_path: str | None) -> None:
     out.print("Fails: " + "; ".join(failed) if failed else "All gates hold.")
 
 
-def print_register(data: dict[str, Any], json_path: str | None) -> None:
+def print_register(data: dict[str, Any], out: Console) -> None:
     """Short: the reasons are in the Markdown and the JSON."""
-    out = console(json_path)
     table = RichTable(title="Residual risks", title_justify="left")
     for column in ("Failure mode", "Simulated", "Field-blocking"):
         table.add_column(column)
@@ -59,10 +56,9 @@ def print_register(data: dict[str, Any], json_path: str | None) -> None:
     out.print(table)
 
 
-def print_contest(data: dict[str, Any], command: str, json_path: str | None) -> None:
+def print_comparison(data: dict[str, Any], command: str, out: Console) -> None:
     """Totals, what changed by scenario, and the line that repeats it."""
     before, after = data["before"], data["after"]
-    out = console(json_path)
     totals = RichTable(title="Totals", title_justify="left")
     for column in ("Figure", "Before", "After"):
         totals.add_column(column, justify="left" if column == "Figure" else "right")

@@ -16,7 +16,7 @@ from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 from bikeped.lab.cli.conformance_shared import scenarios_option
-from bikeped.lab.cli.governance_tables import print_contest
+from bikeped.lab.cli.governance_tables import print_comparison
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def contest(
     words = shlex.join(["bikeped", "testbench", "contest", challenge, *origin.options()])
     if json_path is not None:
         write_json({"command": words, **found, "trials": trials}, json_path)
-    print_contest(found, words, json_path)
+    print_comparison(found, words, console(json_path))
     if trials is not None:
         mean = trials["sensitivity"]
         if mean["mean"] is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +11,9 @@ from bikeped.lab.endtoend.ablation import AblationStep
 from bikeped.lab.endtoend.matching import MIN_IOU, MIN_VISIBLE
 from bikeped.lab.endtoend.measures import Observations, localisation_rows, recall_rows
 from bikeped.lab.endtoend.run import EndToEndRun
-from bikeped.lab.experiments.deterministic import METRIC_COLUMNS, metric_cells, rounded_percent
-from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
-from bikeped.lab.simulation.metrics import Metrics, finite_or_none
+from bikeped.lab.experiments.deterministic import METRIC_COLUMNS
+from bikeped.lab.result_tables import ExperimentResult, ResultTable
+from bikeped.lab.simulation.metrics import finite_or_none
 from bikeped.lab.simulation.perception import error_table
 from bikeped.lab.simulation.suite import Suite
 from bikeped.types import Kind
@@ -73,7 +73,7 @@ def end_to_end_result(
         "localisation": localisation_rows(seen),
         "paper_localisation": error_table(suite.camera),
     }
-    return ExperimentResult("pixels", data, _tables(data, rungs, suite, scripted, whole))
+    return ExperimentResult("pixels", data, _tables(data))
 
 
 def within_goal(rungs: Sequence[AblationStep]) -> bool:
@@ -120,80 +120,64 @@ def _stage(rungs: Sequence[AblationStep], index: int) -> dict[str, Any]:
     return {"name": rung.name, "adds": rung.adds, **now, "change": change}
 
 
-def _tables(
-    data: dict[str, Any],
-    rungs: Sequence[AblationStep],
-    suite: Suite,
-    scripted: Metrics,
-    whole: Metrics,
-) -> tuple[ResultTable, ...]:
-    stages: list[tuple[CellValue, ...]] = [
-        (rung.name, *metric_cells(rung.metrics.as_dict())[:5], rung.adds) for rung in rungs
-    ]
-    scenarios: list[tuple[CellValue, ...]] = []
-    for i, name in enumerate(suite.names):
-        a, b = scripted.scenario_dict(i), whole.scenario_dict(i)
-        scenarios.append(
-            (
-                name,
-                rounded_percent(a["sensitivity"]),
-                rounded_percent(b["sensitivity"]),
-                rounded_percent(a["specificity"]),
-                rounded_percent(b["specificity"]),
-                a["mean_warning_budget_s"],
-                b["mean_warning_budget_s"],
-            )
-        )
-    recall: list[tuple[CellValue, ...]] = [
-        (r["kind"], f"{r['from_m']:g}-{r['to_m']:g}", r["seen"], *_percents(r, "found", "recall"))
-        for r in data["detection"]["by_distance"]
-        if r["seen"]
-    ]
+def _tables(data: dict[str, Any]) -> tuple[ResultTable, ...]:
     false = data["detection"]["false_per_100_frames"]
     note = ", ".join(f"{kind.label} {false[kind.label]:.2f}" for kind in Kind)
-    places: list[tuple[CellValue, ...]] = [
-        (
-            r["kind"],
-            f"{r['from_m']:g}-{r['to_m']:g}",
-            r["found"],
-            *(_metres(r[k]) for k in ("mean_m", "p90_m", "exact_box_mean_m", "box_model_mean_m")),
-        )
-        for r in data["localisation"]
-        if r["found"]
-    ]
+    metrics = dict(list(METRIC_COLUMNS.items())[:5])
+    ring = {"kind": "kind", "distance, m": "ring"}
     return (
-        ResultTable(
+        ResultTable.of(
             "stages",
             "From the scripted run to pixels, stage by stage",
-            ("stage", *METRIC_COLUMNS[:5], "what it adds"),
-            stages,
+            data["stages"],
+            {"stage": "name", **metrics, "what it adds": "adds"},
         ),
-        ResultTable(
+        ResultTable.of(
             "scenarios",
             "Scripted and from pixels, by scenario",
-            ("scenario", "sens, %", "pixels, %", "spec, %", "pixels %", "budget, s", "pixels, s"),
-            scenarios,
+            [{"name": name, **row} for name, row in data["by_scenario"].items()],
+            {
+                "scenario": "name",
+                "sens, %": "scripted.sensitivity",
+                "pixels, %": "pixels.sensitivity",
+                "spec, %": "scripted.specificity",
+                "pixels %": "pixels.specificity",
+                "budget, s": "scripted.mean_warning_budget_s",
+                "pixels, s": "pixels.mean_warning_budget_s",
+            },
         ),
-        ResultTable(
+        ResultTable.of(
             "recall",
             "Found by the detector, by distance",
-            ("kind", "distance, m", "seen", "found, %", "as itself, %"),
-            recall,
-            note=f"false detections per 100 frames: {note}",
+            _with_rings(r for r in data["detection"]["by_distance"] if r["seen"]),
+            {**ring, "seen": "seen", "found, %": "found", "as itself, %": "recall"},
+            f"false detections per 100 frames: {note}",
         ),
-        ResultTable(
+        ResultTable.of(
             "localisation",
             "Localisation error by distance, metres",
-            ("kind", "distance, m", "found", "mean", "90th", "exact box", "box model"),
-            places,
-            note="box model: the simulation's (the paper's table), over the same objects",
+            _with_rings(r for r in data["localisation"] if r["found"]),
+            {
+                **ring,
+                "found": "found",
+                "mean": "mean_m",
+                "90th": "p90_m",
+                "exact box": "exact_box_mean_m",
+                "box model": "box_model_mean_m",
+            },
+            "box model: the simulation's (the paper's table), over the same objects",
         ),
     )
 
 
-def _percents(row: dict[str, Any], *names: str) -> tuple[CellValue, ...]:
-    return tuple(rounded_percent(row[name]) for name in names)
-
-
-def _metres(value: float | None) -> CellValue:
-    return None if value is None else round(value, 3)
+def _with_rings(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows with the bounds of their distance ring as text, and metres rounded to millimetres."""
+    return [
+        {
+            **{
+                k: round(v, 3) if isinstance(v, float) and k.endswith("_m") else v for k, v in items
+            },
+            "ring": ring,
+        }
+        for items, ring in ((r.items(), f"{r['from_m']:g}-{r['to_m']:g}") for r in rows)
+    ]

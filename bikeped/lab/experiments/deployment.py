@@ -1,6 +1,6 @@
-"""Where cameras stand and how they look: road widths, one or two poles, height and pitch.
+"""Camera deployment: road widths, one or two poles, mounting height and pitch.
 
-Definitions, section 11. What it leaves open is chosen so: the lens is equidistant with 220 degrees
+Definitions, section 11. What it leaves open: the lens is equidistant with 220 degrees
 in the deployed camera's image circle (radius, optical centre and sensor window unchanged); the
 cyclist rides across the pedestrian's way in the middle of the road, so that both would be at
 (5, 0) at the same time, and rides on for 10 m; the pedestrian walks from kerb to kerb.
@@ -8,9 +8,9 @@ cyclist rides across the pedestrian's way in the middle of the road, so that bot
 Two cameras: an object is detected with probability 1 - (1 - AR1)(1 - AR2), at the position of the
 camera in whose image it is larger, in the first camera's ground frame.
 
-An object of which no corner is visible keeps its true position and the recall of the smallest
-objects (definitions, section 3). That flatters a camera that looks past the crossing, so every row
-also says what remains when such an object is never detected (`visible_only`).
+An object without a visible corner keeps its true position and the recall of the smallest objects
+(definitions, section 3). That flatters a camera that looks past the crossing, so every row also
+holds the result when such an object is never detected (`visible_only`).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ import numpy as np
 
 from bikeped.config import DecisionConfig
 from bikeped.geometry import CameraPose, GroundCamera, Lens
-from bikeped.lab.experiments.deterministic import ProgressCallback, no_progress, rounded_percent
-from bikeped.lab.experiments.montecarlo import (
+from bikeped.lab.experiments.trials import (
     DetectableObjects,
     LossModel,
     simulate_views,
     summarize_metrics,
 )
+from bikeped.lab.process_pool import ProgressCallback, no_progress
 from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.metrics import GroundTruthFrames
@@ -80,7 +80,7 @@ def wide_camera(camera: GroundCamera, height_m: float, pitch_deg: float) -> Grou
     return replace(camera, lens=lens, height_m=height_m, pitch_deg=pitch_deg, heading_deg=0.0)
 
 
-def poses(width_ft: float, cameras: int) -> tuple[CameraPose, ...]:
+def camera_poses(width_ft: float, cameras: int) -> tuple[CameraPose, ...]:
     """One pole at the near kerb, or a second opposite, looking back."""
     half = width_ft * FOOT_M / 2
     near, far = CameraPose(CROSSING_X_M, -half, 90.0), CameraPose(CROSSING_X_M, half, 270.0)
@@ -90,27 +90,27 @@ def poses(width_ft: float, cameras: int) -> tuple[CameraPose, ...]:
 def detectable_objects(
     scenario: Scenario,
     camera: GroundCamera,
-    where: Sequence[CameraPose],
+    poses: Sequence[CameraPose],
     recall: RecallModel = _SIZE,
     visible_only: bool = False,
 ) -> DetectableObjects:
-    """What one camera, or several fused, could detect; see the module's text."""
-    seen = [simulate_perception(scenario, camera, pose) for pose in where]
-    return fuse_cameras(scenario.name, seen, where, recall, visible_only)
+    """What one camera, or several fused, can detect; see the module's docstring."""
+    seen = [simulate_perception(scenario, camera, pose) for pose in poses]
+    return fuse_cameras(scenario.name, seen, poses, recall, visible_only)
 
 
 def fuse_cameras(
     name: str,
     seen: Sequence[PerceptionResult],
-    where: Sequence[CameraPose],
+    poses: Sequence[CameraPose],
     recall: RecallModel = _SIZE,
     visible_only: bool = False,
 ) -> DetectableObjects:
-    """The same from what each camera, at `where`, made of scenario `name`."""
+    """As `detectable_objects`, from each camera's perception (`seen`, at `poses`) of a scenario."""
     rates = [_recall(s, recall, visible_only) for s in seen]
     xy, area = seen[0].observed_m, seen[0].area_px2
-    for pose, other in zip(where[1:], seen[1:], strict=True):
-        moved = where[0].world_to_ground(pose.ground_to_world(other.observed_m))
+    for pose, other in zip(poses[1:], seen[1:], strict=True):
+        moved = poses[0].world_to_ground(pose.ground_to_world(other.observed_m))
         larger = other.area_px2 > area
         xy = np.where(larger[..., None], moved, xy)
         area = np.maximum(area, other.area_px2)
@@ -123,7 +123,7 @@ def _recall(seen: PerceptionResult, recall: RecallModel, visible_only: bool) -> 
     return np.where(seen.area_px2 > 0, rate, 0.0) if visible_only else rate
 
 
-def _measured(
+def _measure_views(
     scenario: Scenario,
     views: Sequence[tuple[GroundCamera, Sequence[CameraPose]]],
     decision: DecisionConfig,
@@ -134,15 +134,15 @@ def _measured(
     """By view: summaries over trials by the definition, and with invisible objects undetected."""
     truth = GroundTruthFrames.join([compute_ground_truth(scenario)])
     observed = [
-        [detectable_objects(scenario, camera, where, recall, visible_only)]
+        [detectable_objects(scenario, camera, poses, recall, visible_only)]
         for visible_only in (False, True)
-        for camera, where in views
+        for camera, poses in views
     ]
     found = simulate_views(
         observed, truth, LossModel(recall, None), {"": decision}, range(trials), seed
     )
-    told = [summarize_metrics(part[0, 0][""]) for part in found]
-    return list(zip(told[: len(views)], told[len(views) :], strict=True))
+    results = [summarize_metrics(part[0, 0][""]) for part in found]
+    return list(zip(results[: len(views)], results[len(views) :], strict=True))
 
 
 def deployment(
@@ -156,53 +156,40 @@ def deployment(
     """Road widths, one camera and two, both mounts. Progress counts widths."""
     cases = [(height, pitch, cameras) for height, pitch in MOUNTS for cameras in (1, 2)]
     rows: list[dict[str, Any]] = []
-    for count, width in enumerate(WIDTHS_FT):
-        views = [(wide_camera(camera, h, p), poses(width, n)) for h, p, n in cases]
-        told = _measured(road_scenario(width), views, decision, trials, seed, recall)
+    for count, width in enumerate(WIDTHS_FT, 1):
+        views = [(wide_camera(camera, h, p), camera_poses(width, n)) for h, p, n in cases]
+        found = _measure_views(road_scenario(width), views, decision, trials, seed, recall)
         rows += [
             {
                 "width_ft": width,
                 "cameras": cameras,
                 "height_m": height,
                 "pitch_deg": pitch,
-                **usual,
+                **by_definition,
                 "visible_only": visible,
             }
-            for (height, pitch, cameras), (usual, visible) in zip(cases, told, strict=True)
+            for (height, pitch, cameras), (by_definition, visible) in zip(cases, found, strict=True)
         ]
-        progress(count + 1)
+        progress(count)
     rows.sort(key=lambda r: (-r["height_m"], r["cameras"], r["width_ft"]))
     data = {"rows": rows, "trials": trials, "seed": seed, "recall": recall.mode, "fov_deg": FOV_DEG}
-    table = ResultTable(
+    table = ResultTable.of(
         "deployment",
         "Road widths, one camera and two",
-        (
-            "height, m",
-            "pitch, degrees",
-            "cameras",
-            "width, ft",
-            "sens, %",
-            "from, %",
-            "to, %",
-            "spec, %",
-            "visible only, %",
-        ),
-        [
-            (
-                row["height_m"],
-                row["pitch_deg"],
-                row["cameras"],
-                row["width_ft"],
-                rounded_percent(row["sensitivity"]["mean"]),
-                rounded_percent(row["sensitivity"]["low"]),
-                rounded_percent(row["sensitivity"]["high"]),
-                rounded_percent(row["specificity"]["mean"]),
-                rounded_percent(row["visible_only"]["sensitivity"]["mean"]),
-            )
-            for row in rows
-        ],
-        f"{trials} trials; from and to: 95 % confidence interval of the mean; visible only: what "
-        "no camera can see is never detected",
+        rows,
+        {
+            "height, m": "height_m",
+            "pitch, degrees": "pitch_deg",
+            "cameras": "cameras",
+            "width, ft": "width_ft",
+            "sens, %": "sensitivity.mean",
+            "from, %": "sensitivity.low",
+            "to, %": "sensitivity.high",
+            "spec, %": "specificity.mean",
+            "visible only, %": "visible_only.sensitivity.mean",
+        },
+        f"{trials} trials; from and to: 95 % confidence interval of the mean; visible only: "
+        "objects that no camera sees are never detected",
     )
     return ExperimentResult("deployment", data, (table,))
 
@@ -217,19 +204,19 @@ def placement(
 ) -> ExperimentResult:
     """Height by pitch on a road of 40 ft, one camera. Progress counts heights."""
     scenario = road_scenario(PLACEMENT_WIDTH_FT)
-    where = poses(PLACEMENT_WIDTH_FT, 1)
+    poses = camera_poses(PLACEMENT_WIDTH_FT, 1)
     grids: dict[str, list[list[float | None]]] = {
         "sensitivity": [],
         "specificity": [],
         "visible_only_sensitivity": [],
     }
-    for count, height in enumerate(HEIGHTS_M):
-        views = [(wide_camera(camera, height, pitch), where) for pitch in PITCHES_DEG]
-        told = _measured(scenario, views, decision, trials, seed, recall)
-        grids["sensitivity"].append([usual["sensitivity"]["mean"] for usual, _ in told])
-        grids["specificity"].append([usual["specificity"]["mean"] for usual, _ in told])
-        grids["visible_only_sensitivity"].append([v["sensitivity"]["mean"] for _, v in told])
-        progress(count + 1)
+    for count, height in enumerate(HEIGHTS_M, 1):
+        views = [(wide_camera(camera, height, pitch), poses) for pitch in PITCHES_DEG]
+        found = _measure_views(scenario, views, decision, trials, seed, recall)
+        for key in ("sensitivity", "specificity"):
+            grids[key].append([by_definition[key]["mean"] for by_definition, _ in found])
+        grids["visible_only_sensitivity"].append([v["sensitivity"]["mean"] for _, v in found])
+        progress(count)
     data = {
         "height_m": list(HEIGHTS_M),
         "pitch_deg": list(PITCHES_DEG),
@@ -240,23 +227,23 @@ def placement(
         "recall": recall.mode,
         "fov_deg": FOV_DEG,
     }
-    columns = ("height, m", *(f"{pitch:g}\N{DEGREE SIGN}, %" for pitch in PITCHES_DEG))
+    columns = {f"{pitch:g}\N{DEGREE SIGN}, %": str(i) for i, pitch in enumerate(PITCHES_DEG)}
     tables = tuple(
-        ResultTable(
+        ResultTable.of(
             name,
             title,
-            columns,
             [
-                (height, *(rounded_percent(value) for value in row))
+                {"height": height, **{str(i): value for i, value in enumerate(row)}}
                 for height, row in zip(HEIGHTS_M, grids[grid], strict=True)
             ],
+            {"height, m": "height", **columns},
             f"{trials} trials a cell",
         )
         for name, title, grid in (
             ("placement", "Sensitivity by height and pitch", "sensitivity"),
             (
                 "placement_visible_only",
-                "Sensitivity by height and pitch, what is not visible never detected",
+                "Sensitivity by height and pitch, objects out of sight never detected",
                 "visible_only_sensitivity",
             ),
         )

@@ -1,4 +1,4 @@
-"""The experiments that need no chance: scenario table, comparison, errors, truth, braking.
+"""Experiments without random numbers: scenarios, comparison, localisation, truth, braking.
 
 Each maps a suite to an `ExperimentResult`: `data` in plain JSON with exact figures (null where
 there is none), tables for people in per cent with one decimal.
@@ -7,7 +7,7 @@ there is none), tables for people in per cent with one decimal.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
 from bikeped.decision.episodes import onsets
 from bikeped.errors import ScenarioError
-from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
+from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells
 from bikeped.lab.scenarios.scenario import SIZES_M
 from bikeped.lab.simulation.metrics import Metrics, finite_or_none, measure
 from bikeped.lab.simulation.perception import error_table, localise
@@ -26,19 +26,16 @@ from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, camera_json, com
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruthSettings
 from bikeped.types import State
 
-ProgressCallback = Callable[[int], None]
-
-#: The metrics of the short tables: key, column, factor, decimals. The columns are short, for a
-#: terminal of 80 columns holds them; `contact` is the contact sensitivity.
-TABLE_METRICS = (
-    ("sensitivity", "sens, %", 100.0, 1),
-    ("specificity", "spec, %", 100.0, 1),
-    ("sev_fn", "SevFN, %", 100.0, 1),
-    ("fatigue", "fatigue, %", 100.0, 1),
-    ("mean_warning_budget_s", "budget, s", 1.0, 2),
-    ("contact_sensitivity", "contact, %", 100.0, 1),
-)
-METRIC_COLUMNS = tuple(column for _, column, _, _ in TABLE_METRICS)
+#: The metrics of the short tables, by column. The columns are short, to fit a terminal of 80
+#: columns; `contact` is the contact sensitivity.
+METRIC_COLUMNS = {
+    "sens, %": "sensitivity",
+    "spec, %": "specificity",
+    "SevFN, %": "sev_fn",
+    "fatigue, %": "fatigue",
+    "budget, s": "mean_warning_budget_s",
+    "contact, %": "contact_sensitivity",
+}
 
 #: Thresholds of the ground truth that are varied one at a time (paper, table 4).
 CPA_RADII_M = (3.0, 5.0, 7.0)
@@ -48,25 +45,8 @@ MAP_STEP_M = 0.5
 MAP_REACH_M = 25.0
 
 
-def no_progress(done: int) -> None:
-    """Progress that nobody watches."""
-
-
-def rounded_percent(value: float | None) -> float | None:
-    """A share for a table: per cent, one decimal."""
-    return None if value is None else round(100 * value, 1)
-
-
-def metric_cells(metrics: Mapping[str, Any]) -> tuple[CellValue, ...]:
-    """The cells of `TABLE_METRICS` from a metrics dictionary."""
-    return tuple(
-        None if metrics.get(key) is None else round(metrics[key] * factor, decimals)
-        for key, _, factor, decimals in TABLE_METRICS
-    )
-
-
 def result_provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
-    """What a reader needs to make a result again."""
+    """Version, hashes, camera and seed: what a result depends on."""
     return {
         "version": __version__,
         "scenarios": len(suite.scenarios),
@@ -79,15 +59,15 @@ def result_provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str
 
 
 def select_scenario(suite: Suite, name: str) -> Suite:
-    """The suite with only the scenario of this name (upper and lower case are alike)."""
+    """The suite with only the scenario of this name (case is ignored)."""
     found = [s for s in suite.scenarios if s.name.casefold() == name.strip().casefold()]
     if not found:
         known = {n.casefold(): n for n in suite.names}
         near = difflib.get_close_matches(name.casefold(), known, 1, 0.4)
-        mend = (
+        remedy = (
             f"did you mean {known[near[0]]!r}?" if near else f"known are {', '.join(suite.names)}"
         )
-        raise ScenarioError(f"--scenario {name!r}: there is no such scenario; {mend}")
+        raise ScenarioError(f"--scenario {name!r}: there is no such scenario; {remedy}")
     return replace(suite, scenarios=tuple(found))
 
 
@@ -114,46 +94,29 @@ def run_table(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
         )
     totals = metrics.as_dict()
     budgets = warning_budgets(suite, decision)
-    table = ResultTable(
+    table = ResultTable.of(
         "run",
         "Scenarios",
-        (
-            "scenario",
-            "expected",
-            "dominant",
-            "danger",
-            "actionable",
-            "sens, %",
-            "spec, %",
-            "SevFN, %",
-            "fatigue, %",
-            "late, s",
-            "mean budget, s",
-            "min budget, s",
-            "lead, s",
-        ),
-        [
-            (
-                row["scenario"],
-                row["expected"],
-                row["dominant"],
-                row["danger_frames"],
-                row["actionable_frames"],
-                rounded_percent(row["sensitivity"]),
-                rounded_percent(row["specificity"]),
-                rounded_percent(row["sev_fn"]),
-                rounded_percent(row["fatigue"]),
-                rounded_seconds(row["alert_latency_s"]),
-                rounded_seconds(row["mean_warning_budget_s"]),
-                rounded_seconds(row["min_warning_budget_s"]),
-                rounded_seconds(row["first_onset_lead_s"]),
-            )
-            for row in rows
-        ],
+        rows,
+        {
+            "scenario": "scenario",
+            "expected": "expected",
+            "dominant": "dominant",
+            "danger": "danger_frames",
+            "actionable": "actionable_frames",
+            "sens, %": "sensitivity",
+            "spec, %": "specificity",
+            "SevFN, %": "sev_fn",
+            "fatigue, %": "fatigue",
+            "late, s": "alert_latency_s",
+            "mean budget, s": "mean_warning_budget_s",
+            "min budget, s": "min_warning_budget_s",
+            "lead, s": "first_onset_lead_s",
+        },
         "danger, actionable: frames; late: from the first actionable frame to ALERT; lead: from "
         "the first ALERT to the closest approach",
     )
-    total = ResultTable("run_totals", "All scenarios", METRIC_COLUMNS, [metric_cells(totals)])
+    total = ResultTable.of("run_totals", "All scenarios", [totals], METRIC_COLUMNS)
     return ExperimentResult(
         "run",
         {
@@ -164,11 +127,6 @@ def run_table(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
         },
         (table, total),
     )
-
-
-def rounded_seconds(value: float | None) -> float | None:
-    """A time for a table: two decimals."""
-    return None if value is None else round(value, 2)
 
 
 def compare_table(
@@ -184,7 +142,7 @@ def compare_table(
             name,
             title,
             ("configuration", *METRIC_COLUMNS),
-            [(c, *metric_cells(metrics)) for c, metrics in data[key].items()],
+            [(c, *cells(metrics, METRIC_COLUMNS)) for c, metrics in data[key].items()],
         )
         for name, title, key in (
             ("compare", "Configurations, with localisation error", "configurations"),
@@ -198,7 +156,7 @@ def compare_table(
     return ExperimentResult("compare", data, tables)
 
 
-def errors(suite: Suite) -> ExperimentResult:
+def localisation_errors(suite: Suite) -> ExperimentResult:
     """Localisation error: the paper's table, and a map of the ground in front of the camera.
 
     The map's rows go with `x_m` (forward), its columns with `y_m` (right); objects lie with their
@@ -219,7 +177,7 @@ def errors(suite: Suite) -> ExperimentResult:
             "error_m": [[finite_or_none(v) for v in row] for row in error.reshape(len(x), len(y))],
         }
     distances = list(dict.fromkeys(float(row["distance_m"]) for row in table))
-    cells = {(r["kind"], r["bearing_deg"], r["distance_m"]): float(r["error_m"]) for r in table}
+    error_m = {(r["kind"], r["bearing_deg"], r["distance_m"]): float(r["error_m"]) for r in table}
     lines = list(dict.fromkeys((str(r["kind"]), r["bearing_deg"]) for r in table))
     return ExperimentResult(
         "errors",
@@ -230,7 +188,7 @@ def errors(suite: Suite) -> ExperimentResult:
                 "Localisation error, m",
                 ("kind", "bearing, degrees", *(f"{d:g} m" for d in distances)),
                 [
-                    (kind, bearing, *(round(cells[kind, bearing, d], 2) for d in distances))
+                    (kind, bearing, *(round(error_m[kind, bearing, d], 2) for d in distances))
                     for kind, bearing in lines
                 ],
             ),
@@ -271,7 +229,7 @@ def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> ExperimentResul
                 names[row["parameter"]],
                 "1.87 + clearance" if row["value"] is None else row["value"],
                 "yes" if row["default"] else "",
-                *metric_cells(row),
+                *cells(row, METRIC_COLUMNS),
             )
             for row in rows
         ],
@@ -291,7 +249,7 @@ def braking_profiles(suite: Suite, decision: DecisionConfig) -> ExperimentResult
         "braking",
         "Braking profiles of the ground truth",
         ("profile", *METRIC_COLUMNS),
-        [(row["profile"], *metric_cells(row["metrics"])) for row in rows],
+        [(row["profile"], *cells(row["metrics"], METRIC_COLUMNS)) for row in rows],
         "scenario: bicycle or e-bike, as each scenario says",
     )
     return ExperimentResult("braking", {"rows": rows}, (table,))
@@ -320,20 +278,17 @@ def warning_budgets(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
                 "class": budget_class(worst),
             }
         )
-    table = ResultTable(
+    table = ResultTable.of(
         "budgets",
         "Warning budgets",
-        ("scenario", "mean, s", "min, s", "onsets", "class"),
-        [
-            (
-                r["scenario"],
-                rounded_seconds(r["mean"]),
-                rounded_seconds(r["min"]),
-                len(r["onsets"]),
-                r["class"],
-            )
-            for r in rows
-        ],
+        [{**row, "count": len(row["onsets"])} for row in rows],
+        {
+            "scenario": "scenario",
+            "mean, s": "mean",
+            "min, s": "min",
+            "onsets": "count",
+            "class": "class",
+        },
         f"distracted {PEDESTRIAN_PRT_S} s, attentive {ATTENTIVE_PRT_S} s; by the worst onset",
     )
     return ExperimentResult("budgets", {"rows": rows}, (table,))

@@ -1,6 +1,6 @@
 """Camera latency: detections come late, the world goes on (paper, section 4.7).
 
-The state of a frame is compared with the truth of that frame, whenever the picture was taken.
+The state of a frame is compared with the truth of that frame, not of the capture time.
 """
 
 from __future__ import annotations
@@ -9,13 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bikeped.config import DecisionConfig
-from bikeped.lab.experiments.deterministic import (
-    ProgressCallback,
-    no_progress,
-    rounded_percent,
-    rounded_seconds,
-)
-from bikeped.lab.experiments.montecarlo import (
+from bikeped.lab.experiments.deterministic import METRIC_COLUMNS
+from bikeped.lab.experiments.trials import (
     TRIALS,
     LossModel,
     measure_repetitions,
@@ -23,7 +18,8 @@ from bikeped.lab.experiments.montecarlo import (
     sorted_suite,
     summarize_metrics,
 )
-from bikeped.lab.result_tables import ExperimentResult, ResultTable
+from bikeped.lab.process_pool import ProgressCallback, no_progress
+from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells
 from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.simulate import FPS, track
@@ -55,7 +51,7 @@ def delay_frames(delay_ms: float) -> int:
 def sweep(
     suite: Suite, decision: DecisionConfig, delays_ms: Sequence[float] = DELAYS_MS
 ) -> ExperimentResult:
-    """Every latency with every predictor, without loss: all of them lanes of one tracker."""
+    """Every latency with every predictor, without misses: all in one batch of the tracker."""
     scenes = [
         s for ms in delays_ms for s in suite.detection_sequences(delay_frames=delay_frames(ms))
     ]
@@ -73,32 +69,14 @@ def _table(data: Mapping[str, Any], name: str, title: str) -> ResultTable:
     return ResultTable(
         name,
         title,
-        (
-            "predictor",
-            "delay, ms",
-            "sens, %",
-            "spec, %",
-            "SevFN, %",
-            "fatigue, %",
-            "budget, s",
-            "contact, %",
-        ),
+        ("predictor", "delay, ms", *METRIC_COLUMNS),
         [
-            (
-                predictor,
-                ms,
-                rounded_percent(lists["sensitivity"][i]),
-                rounded_percent(lists["specificity"][i]),
-                rounded_percent(lists["sev_fn"][i]),
-                rounded_percent(lists["fatigue"][i]),
-                rounded_seconds(lists["mean_warning_budget_s"][i]),
-                rounded_percent(lists["contact_sensitivity"][i]),
-            )
+            (predictor, ms, *cells({k: values[i] for k, values in lists.items()}, METRIC_COLUMNS))
             for predictor in PREDICTORS
             for lists in (data[predictor],)
             for i, ms in enumerate(data["delay_ms"])
         ],
-        "predictor: how far tracks are carried over the latency (none, velocity, acceleration)",
+        "predictor: how tracks are moved ahead by the latency (none, velocity, acceleration)",
     )
 
 
@@ -113,12 +91,12 @@ def sweep_with_loss(
     processes: int = 1,
     progress: ProgressCallback = no_progress,
 ) -> ExperimentResult:
-    """Latency and lost detections together; size-aware recall, independent losses by default."""
+    """Latency and missed detections together; by default recall by size, independent misses."""
     model = recall or RecallModel("size")
     cases = [(delay_frames(ms), order) for ms in delays_ms for order in PREDICTORS.values()]
-    plan = LossModel(model, burst, tuple(dict.fromkeys(cases)))
+    loss = LossModel(model, burst, tuple(dict.fromkeys(cases)))
     found = run_trials(
-        sorted_suite(suite), [plan], {"": decision}, trials, seed, processes, progress
+        sorted_suite(suite), [loss], {"": decision}, trials, seed, processes, progress
     )[0]
     predictors: dict[str, Any] = {}
     for name, order in PREDICTORS.items():

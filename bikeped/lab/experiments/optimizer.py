@@ -18,13 +18,9 @@ from scipy.optimize import Bounds, differential_evolution
 
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.errors import ScenarioError
-from bikeped.lab.experiments.deterministic import (
-    METRIC_COLUMNS,
-    ProgressCallback,
-    metric_cells,
-    no_progress,
-)
-from bikeped.lab.result_tables import ExperimentResult, ResultTable
+from bikeped.lab.experiments.deterministic import METRIC_COLUMNS
+from bikeped.lab.process_pool import ProgressCallback, no_progress
+from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells
 from bikeped.lab.simulation.metrics import Metrics, measure
 from bikeped.lab.simulation.simulate import states
 from bikeped.lab.simulation.suite import Suite
@@ -150,7 +146,7 @@ def optimize(
                 round(d.d_max_m, 3),
                 round(d.min_displacement_m, 4),
                 d.lookback_frames,
-                *metric_cells(m.as_dict()),
+                *cells(m.as_dict(), METRIC_COLUMNS),
             )
             for name, value, d, m in (
                 ("configured", cost(before), base, before),

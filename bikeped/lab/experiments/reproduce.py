@@ -1,8 +1,8 @@
-"""All experiments in all cores, with every table and figure, resumed after an interruption.
+"""All experiments on all cores, with every table and figure, resumed after an interruption.
 
-Each experiment is one job; the longest start first. A finished one is written whole to
-`data/<name>.json` with a key made of everything it depends on (scenarios, configuration, code,
-parameters) and is taken from there when the key is the same.
+Each experiment is one job; the longest start first. A finished one is written to
+`data/<name>.json` with a key over everything it depends on (scenarios, configuration, code,
+parameters) and is read from there when the key is the same.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,15 +18,24 @@ from typing import Any
 
 import numpy as np
 
+from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.experiments import deployment, latency, montecarlo, optimizer
-from bikeped.lab.experiments import deterministic as experiments
-from bikeped.lab.experiments.deterministic import ProgressCallback, no_progress, result_provenance
-from bikeped.lab.process_pool import worker_pool
+from bikeped.lab.experiments.deterministic import (
+    braking_profiles,
+    compare_table,
+    localisation_errors,
+    result_provenance,
+    run_table,
+    truth_sensitivity,
+    warning_budgets,
+)
+from bikeped.lab.experiments.trials import TRIALS
+from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.result_tables import ExperimentResult, ResultTable
-from bikeped.lab.simulation.perception import RecallModel
+from bikeped.lab.simulation.perception import RecallCurve, RecallModel, recall_models
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 
 #: Parts of bikeped whose source decides what an experiment gives.
@@ -38,10 +46,10 @@ _CODE = (*DECIDING_CODE, *MEASURING_CODE, "config", "types")
 class ReproduceSettings:
     """What a reproduction may vary."""
 
-    trials: int = montecarlo.TRIALS
+    trials: int = TRIALS
     seed: int = 0
     burst: float = montecarlo.BURST_FRAMES
-    curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    curve: RecallCurve | None = None
     maxiter: int = optimizer.MAXITER
     popsize: int = optimizer.POPSIZE
     deployment_trials: int = deployment.DEPLOYMENT_TRIALS
@@ -50,81 +58,37 @@ class ReproduceSettings:
     @property
     def recall(self) -> RecallModel:
         """The finest recall model there is."""
-        return montecarlo.recall_models(self.curve)[-1]
+        return recall_models(self.curve)[-1]
 
 
 Experiment = Callable[[Suite, LoadedConfig, ReproduceSettings], ExperimentResult]
-
-
-def _montecarlo(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return montecarlo.montecarlo(suite, CONFIGURATIONS, s.trials, s.seed, s.burst, s.curve)
-
-
-def _latency_loss(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return latency.sweep_with_loss(
-        suite, loaded.config.decision, recall=s.recall, trials=s.trials, seed=s.seed
-    )
-
-
-def _optimize(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return optimizer.optimize(suite, loaded.config.decision, maxiter=s.maxiter, popsize=s.popsize)
-
-
-def _deployment(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    decision = loaded.config.decision
-    return deployment.deployment(suite.camera, decision, s.deployment_trials, s.seed, s.recall)
-
-
-def _placement(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    decision = loaded.config.decision
-    return deployment.placement(suite.camera, decision, s.placement_trials, s.seed, s.recall)
-
-
-def _latency(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return latency.sweep(suite, loaded.config.decision)
-
-
-def _truth(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return experiments.truth_sensitivity(suite, loaded.config.decision)
-
-
-def _braking(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return experiments.braking_profiles(suite, loaded.config.decision)
-
-
-def _run(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return experiments.run_table(suite, loaded.config.decision)
-
-
-def _budgets(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return experiments.warning_budgets(suite, loaded.config.decision)
-
-
-def _compare(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return experiments.compare_table(suite, loaded, seed=s.seed)
-
-
-def _errors(suite: Suite, loaded: LoadedConfig, s: ReproduceSettings) -> ExperimentResult:
-    return experiments.errors(suite)
-
-
-#: The longest first, so that no core waits long at the end.
+#: By name: the longest first, so that no core waits long at the end.
 EXPERIMENTS: dict[str, Experiment] = {
-    "montecarlo": _montecarlo,
-    "optimize": _optimize,
-    "latency_loss": _latency_loss,
-    "deployment": _deployment,
-    "placement": _placement,
-    "latency": _latency,
-    "truth": _truth,
-    "braking": _braking,
-    "run": _run,
-    "compare": _compare,
-    "budgets": _budgets,
-    "errors": _errors,
+    "montecarlo": lambda suite, _, s: montecarlo.montecarlo(
+        suite, CONFIGURATIONS, s.trials, s.seed, s.burst, s.curve
+    ),
+    "optimize": lambda suite, loaded, s: optimizer.optimize(
+        suite, loaded.config.decision, maxiter=s.maxiter, popsize=s.popsize
+    ),
+    "latency_loss": lambda suite, loaded, s: latency.sweep_with_loss(
+        suite, loaded.config.decision, recall=s.recall, trials=s.trials, seed=s.seed
+    ),
+    "deployment": lambda suite, loaded, s: deployment.deployment(
+        suite.camera, loaded.config.decision, s.deployment_trials, s.seed, s.recall
+    ),
+    "placement": lambda suite, loaded, s: deployment.placement(
+        suite.camera, loaded.config.decision, s.placement_trials, s.seed, s.recall
+    ),
+    "latency": lambda suite, loaded, _: latency.sweep(suite, loaded.config.decision),
+    "truth": lambda suite, loaded, _: truth_sensitivity(suite, loaded.config.decision),
+    "braking": lambda suite, loaded, _: braking_profiles(suite, loaded.config.decision),
+    "run": lambda suite, loaded, _: run_table(suite, loaded.config.decision),
+    "compare": lambda suite, loaded, s: compare_table(suite, loaded, seed=s.seed),
+    "budgets": lambda suite, loaded, _: warning_budgets(suite, loaded.config.decision),
+    "errors": lambda suite, loaded, _: localisation_errors(suite),
 }
-#: The order of the index page.
-SHOWN_ORDER = (
+#: The order of the report.
+REPORT_ORDER = (
     "run",
     "compare",
     "budgets",
@@ -165,25 +129,42 @@ def cache_key(name: str, suite: Suite, loaded: LoadedConfig, settings: Reproduce
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def compute(
-    name: str, suite: Suite, loaded: LoadedConfig, settings: ReproduceSettings
-) -> tuple[ExperimentResult, float]:
-    """One experiment and the seconds it took: the job of a process."""
-    begin = time.perf_counter()
-    result = EXPERIMENTS[name](suite, loaded, settings)
-    return result, time.perf_counter() - begin
+def run_experiment(
+    name: str,
+    key: str,
+    suite: Suite,
+    loaded: LoadedConfig,
+    settings: ReproduceSettings,
+    folder: Path,
+    figures: bool,
+) -> tuple[ExperimentResult, float | None, list[Path]]:
+    """One experiment: its result, the seconds that it took (None: stored under `key` before), and
+    its figures. The job of a process."""
+    path = folder / "data" / f"{name}.json"
+    result, seconds = read_stored(path, key), None
+    if result is None:
+        begin = time.perf_counter()
+        result = EXPERIMENTS[name](suite, loaded, settings)
+        seconds = time.perf_counter() - begin
+        document = {
+            "key": key,
+            "provenance": result_provenance(suite, loaded, settings.seed),
+            "seconds": seconds,
+            "data": result.data,
+            "tables": [_table_dict(table) for table in result.tables],
+        }
+        write_whole(path, _json(document))
+    drawn: list[Path] = []
+    if figures:
+        from bikeped.lab.experiments.figures import draw_all
 
-
-def draw_figures(result: ExperimentResult, suite: Suite, folder: Path) -> list[Path]:
-    """The figures of one experiment: the job of a process too."""
-    from bikeped.lab.experiments.figures import draw_all
-
-    return draw_all({result.name: result.data}, suite, folder)
+        drawn = draw_all({name: result.data}, suite, folder / "figures")
+    return result, seconds, drawn
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What a run left: results in the order of the page, those reused, files, seconds."""
+    """Results in the order of the report, names of reused ones, seconds of the others, files."""
 
     results: tuple[ExperimentResult, ...]
     reused: tuple[str, ...]
@@ -201,80 +182,32 @@ def reproduce(
     figures: bool = True,
     progress: ProgressCallback = no_progress,
 ) -> Reproduction:
-    """Runs every experiment that is not there yet, then writes tables, figures and the page.
+    """Runs every experiment that is not stored yet, then writes tables, figures and the report.
 
-    Progress counts experiments, and the figures as one more.
+    Progress counts experiments, and the report as one more.
     """
-    data_folder, table_folder = folder / "data", folder / "tables"
-    for part in (data_folder, table_folder):
-        make_folder(part)
-    keys = {name: cache_key(name, suite, loaded, settings) for name in EXPERIMENTS}
-    found: dict[str, ExperimentResult] = {}
-    seconds: dict[str, float] = {}
-    for name, key in keys.items():
-        stored = read_stored(data_folder / f"{name}.json", key)
-        if stored is not None:
-            found[name] = stored
-    reused = tuple(found)
-    progress(len(found))
-    stamp = result_provenance(suite, loaded, settings.seed)
-
-    def keep(name: str, result: ExperimentResult, took: float) -> None:
-        found[name], seconds[name] = result, took
-        document = {
-            "key": keys[name],
-            "provenance": stamp,
-            "seconds": took,
-            "data": result.data,
-            "tables": [_table_dict(table) for table in result.tables],
-        }
-        write_whole(data_folder / f"{name}.json", _json(document))
-        progress(len(found))
-
-    _ = suite.truth_frames, suite.rule_input  # made once, before the suite goes to every process
-    missing = [name for name in EXPERIMENTS if name not in found]
-    pictures: dict[str, list[Path]] = {}
-    if processes > 1:
-        with worker_pool(processes) as pool:
-            jobs: dict[Future[Any], tuple[str, bool]] = {}
-
-            def picture(name: str) -> None:
-                if figures:
-                    job = pool.submit(draw_figures, found[name], suite, folder / "figures")
-                    jobs[job] = (name, True)
-
-            for name in missing:
-                jobs[pool.submit(compute, name, suite, loaded, settings)] = (name, False)
-            for name in reused:
-                picture(name)
-            while jobs:
-                for job in wait(jobs, return_when=FIRST_COMPLETED).done:
-                    name, is_picture = jobs.pop(job)
-                    if is_picture:
-                        pictures[name] = job.result()
-                    else:
-                        keep(name, *job.result())
-                        picture(name)
-    else:
-        for name in missing:
-            keep(name, *compute(name, suite, loaded, settings))
-        if figures:
-            for name, result in found.items():
-                pictures[name] = draw_figures(result, suite, folder / "figures")
-
-    results = tuple(found[name] for name in SHOWN_ORDER)
+    for part in ("data", "tables"):
+        make_folder(folder / part)
+    progress(0)
+    _ = suite.truth_frames, suite.rule_input  # computed once, before the suite goes to the workers
+    jobs = [
+        (name, cache_key(name, suite, loaded, settings), suite, loaded, settings, folder, figures)
+        for name in EXPERIMENTS
+    ]
+    done = dict(zip(EXPERIMENTS, run_jobs(run_experiment, jobs, processes, progress), strict=True))
+    results = tuple(done[name][0] for name in REPORT_ORDER)
     for result in results:
         for table in result.tables:
-            write_whole(table_folder / f"{table.name}.csv", table.csv())
-            write_whole(table_folder / f"{table.name}.json", _json(_table_dict(table)))
-    drawn = tuple(path for name in SHOWN_ORDER for path in pictures.get(name, []))
+            write_whole(folder / "tables" / f"{table.name}.csv", table.csv())
+            write_whole(folder / "tables" / f"{table.name}.json", _json(_table_dict(table)))
+    drawn = tuple(path for name in REPORT_ORDER for path in done[name][2])
     index: Path | None = None
     if figures:
         from bikeped.lab.experiments.report import write_index
 
-        said = {
-            "version": str(stamp["version"]),
-            "scenarios": str(stamp["scenarios"]),
+        provenance = {
+            "version": __version__,
+            "scenarios": str(len(suite.scenarios)),
             "suite": suite.hash,
             "configuration": loaded.hash,
             "calibration": loaded.calibration_hash or "none",
@@ -283,8 +216,10 @@ def reproduce(
             "seed": str(settings.seed),
             "optimiser's seed": str(optimizer.SEED),
         }
-        index = write_index(folder, list(results), list(drawn), said)
+        index = write_index(folder, results, drawn, provenance)
     progress(len(EXPERIMENTS) + 1)
+    seconds = {name: taken for name, (_, taken, _) in done.items() if taken is not None}
+    reused = tuple(name for name in done if name not in seconds)
     return Reproduction(results, reused, seconds, drawn, index)
 
 
@@ -296,11 +231,7 @@ def read_stored(path: Path, key: str) -> ExperimentResult | None:
             return None
         tables = tuple(
             ResultTable(
-                t["name"],
-                t["title"],
-                tuple(t["columns"]),
-                [tuple(row) for row in t["rows"]],
-                t["note"],
+                **{**t, "columns": tuple(t["columns"]), "rows": [tuple(row) for row in t["rows"]]}
             )
             for t in document["tables"]
         )
@@ -310,13 +241,7 @@ def read_stored(path: Path, key: str) -> ExperimentResult | None:
 
 
 def _table_dict(table: ResultTable) -> dict[str, Any]:
-    return {
-        "name": table.name,
-        "title": table.title,
-        "columns": list(table.columns),
-        "rows": [list(row) for row in table.rows],
-        "note": table.note,
-    }
+    return {**vars(table), "rows": [list(row) for row in table.rows]}
 
 
 def _json(document: Mapping[str, Any]) -> str:

@@ -37,17 +37,16 @@ SIZE_BOUNDS_PX2 = (32.0**2, 96.0**2)
 SIZE_RECALL = (0.514, 0.725, 0.832)
 
 RecallMode = Literal["flat", "size", "curve"]
+#: Bin centres (px^2 at the network's input, increasing) and the recall of each bin.
+RecallCurve = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
 class RecallModel:
-    """Recall of an object: by kind, by size class, or by a curve over projected area.
-
-    `curve` holds bin centres (px^2 at the network's input) and the recall of each bin.
-    """
+    """Recall of an object: by kind, by size class, or by a curve over projected area."""
 
     mode: RecallMode = "size"
-    curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    curve: RecallCurve | None = None
 
     def recall(self, kind: KindArray, area_px2: FloatArray) -> FloatArray:
         """Recall of objects, elementwise."""
@@ -59,6 +58,12 @@ class RecallModel:
                 raise ValueError("recall curve: none is given")
             return np.asarray(np.interp(area_px2, *self.curve))
         return np.asarray(SIZE_RECALL)[np.searchsorted(SIZE_BOUNDS_PX2, area_px2, side="right")]
+
+
+def recall_models(curve: RecallCurve | None) -> list[RecallModel]:
+    """The recall models, from the coarsest to the finest; the last by `curve`, when given."""
+    models = [RecallModel("flat"), RecallModel("size")]
+    return models if curve is None else [*models, RecallModel("curve", curve)]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError
 from bikeped.geometry import CameraPose
 from bikeped.lab.experiments.deployment import fuse_cameras
-from bikeped.lab.experiments.montecarlo import (
+from bikeped.lab.experiments.trials import (
     DetectableObjects,
     LossModel,
     simulate_trials,

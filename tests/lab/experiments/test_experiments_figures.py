@@ -3,13 +3,12 @@
 import re
 import sys
 
-import click
 import numpy as np
 import pytest
 
 from bikeped.config import DecisionConfig, load_config
 from bikeped.errors import BikepedError
-from bikeped.lab.cli import conformance_governance as governance
+from bikeped.lab.cli.conformance import command as conformance
 from bikeped.lab.experiments.figures import FIGURES, draw_all
 from bikeped.lab.experiments.scenario_plan import draw_plan
 from bikeped.lab.experiments.strip_chart import draw_strip, spans
@@ -169,9 +168,9 @@ def test_spans():
     assert np.allclose(found, [(0, 2 / 30), (4 / 30, 6 / 30)])
 
 
-def test_without_matplotlib_the_mend_is_named(suite, tmp_path, monkeypatch):
+def test_without_matplotlib_the_remedy_is_named(suite, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(BikepedError, match=r'pip install "bikeped\[sim\]"'):
+    with pytest.raises(BikepedError, match=r"pip install 'bikeped\[sim\]'"):
         draw_all(DATA, suite, tmp_path)
     with pytest.raises(BikepedError, match="matplotlib"):
         FigureSheet("a", "b")
@@ -195,10 +194,8 @@ def test_plot_draws_one_scenario_and_names_an_unknown_one(tmp_path):
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "x.yaml").write_text(MARKUP)
     (tmp_path / "s" / "y.yaml").write_text(NOBODY)
-    group = click.Group("conformance")
-    governance.add_commands(group)
     arguments = ["plot", "--scenarios", str(tmp_path / "s"), "--out", str(tmp_path / "o")]
-    group.main([*arguments, "--scenario", "Empty"], standalone_mode=False)
+    conformance.main([*arguments, "--scenario", "Empty"], standalone_mode=False)
     assert sorted(p.name for p in (tmp_path / "o").iterdir()) == [
         "empty-plan.pdf",
         "empty-plan.png",
@@ -206,4 +203,4 @@ def test_plot_draws_one_scenario_and_names_an_unknown_one(tmp_path):
         "empty-strip.png",
     ]
     with pytest.raises(BikepedError, match="did you mean 'Empty'"):
-        group.main([*arguments, "--scenario", "Empt"], standalone_mode=False)
+        conformance.main([*arguments, "--scenario", "Empt"], standalone_mode=False)

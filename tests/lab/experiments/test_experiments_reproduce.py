@@ -55,8 +55,8 @@ def test_everything_is_there_and_reused(suite: Suite, tmp_path: Path) -> None:
     first = rep.reproduce(suite, LOADED, tmp_path, SMALL, figures=False, progress=counts.append)
     assert counts == list(range(len(rep.EXPERIMENTS) + 2))
     assert first.reused == ()
-    assert set(rep.SHOWN_ORDER) == set(rep.EXPERIMENTS) == set(first.seconds)
-    assert [r.name for r in first.results] == list(rep.SHOWN_ORDER)
+    assert set(rep.REPORT_ORDER) == set(rep.EXPERIMENTS) == set(first.seconds)
+    assert [r.name for r in first.results] == list(rep.REPORT_ORDER)
     for result in first.results:
         for table in result.tables:
             lines = (tmp_path / "tables" / f"{table.name}.csv").read_text().splitlines()
@@ -85,7 +85,7 @@ def test_two_processes_give_the_same(
     # Fresh processes do not see the patch of the placement grid.
     few = {n: f for n, f in rep.EXPERIMENTS.items() if n not in ("placement", "deployment")}
     monkeypatch.setattr(rep, "EXPERIMENTS", few)
-    monkeypatch.setattr(rep, "SHOWN_ORDER", tuple(few))
+    monkeypatch.setattr(rep, "REPORT_ORDER", tuple(few))
     rep.reproduce(suite, LOADED, tmp_path / "one", SMALL, figures=False)
     rep.reproduce(suite, LOADED, tmp_path / "two", SMALL, processes=2, figures=False)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")

@@ -57,7 +57,7 @@ def test_one_scenario_by_name(suite: Suite) -> None:
 
 
 def test_errors_table_and_map_agree_with_the_camera(suite: Suite) -> None:
-    data = ex.errors(suite).data
+    data = ex.localisation_errors(suite).data
     assert len(data["table"]) == 3 * 7 * 4
     part = data["map"]["cyclist"]
     i, j = part["x_m"].index(8.0), part["y_m"].index(-3.0)
@@ -96,7 +96,7 @@ def test_truth_rows_vary_one_threshold_each(suite: Suite) -> None:
     assert danger[3] > danger[4] > danger[5] or danger[3] >= danger[4] >= danger[5]
     # The straightforward way: a suite made afresh under the thresholds.
     fresh = Suite(
-        suite.scenarios, suite.camera, truth_settings=ex.TruthSettings(stopping_margin=0.6)
+        suite.scenarios, suite.camera, truth_settings=ex.GroundTruthSettings(stopping_margin=0.6)
     )
     alone = fresh.measure(SELECTED).as_dict()
     assert {key: rows[3][key] for key in alone} == alone
@@ -210,7 +210,7 @@ def test_fusion(suite: Suite) -> None:
     scenario = dep.road_scenario(40)
     camera = dep.wide_camera(suite.camera, 5.5, 0.0)
     assert math.degrees(2 * camera.lens.max_theta_rad) == pytest.approx(220)
-    near, far = dep.poses(40, 2)
+    near, far = dep.camera_poses(40, 2)
     seen = [simulate_perception(scenario, camera, pose) for pose in (near, far)]
     model = RecallModel("size")
     rate = [model.recall(np.broadcast_to(s.kind, s.area_px2.shape), s.area_px2) for s in seen]

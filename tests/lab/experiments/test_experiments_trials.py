@@ -13,6 +13,7 @@ import pytest
 from bikeped.config import load_config, rule_settings
 from bikeped.errors import BikepedError
 from bikeped.lab.experiments import montecarlo as mc
+from bikeped.lab.experiments import trials
 from bikeped.lab.experiments.latency import (
     DELAYS_MS,
     PREDICTORS,
@@ -20,6 +21,7 @@ from bikeped.lab.experiments.latency import (
     sweep,
     sweep_with_loss,
 )
+from bikeped.lab.experiments.recall_curve import load_recall_curve
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.metrics import measure
 from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator
@@ -44,7 +46,7 @@ def suite() -> Suite:
     return Suite.load(scenarios, load_config(CONFIG))
 
 
-def comparable(result: mc.Result) -> str:
+def comparable(result: mc.ExperimentResult) -> str:
     return json.dumps(result.data, sort_keys=True, allow_nan=False)
 
 
@@ -56,18 +58,18 @@ def test_processes_and_order_of_scenarios_change_nothing(suite: Suite) -> None:
     assert comparable(mc.montecarlo(suite, TWO, trials=5, seed=4)) != comparable(once)
 
 
-def test_size_of_chunks_changes_nothing(suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_size_of_batches_changes_nothing(suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = mc.montecarlo(suite, TWO, trials=5)
-    monkeypatch.setattr(mc, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(trials, "BATCH_BYTES", 1)
     assert comparable(mc.montecarlo(suite, TWO, trials=5)) == comparable(whole)
 
 
 @pytest.mark.parametrize("burst", [None, 5.0])
 def test_a_trial_is_what_it_is_alone(suite: Suite, burst: float | None) -> None:
     """One scenario, one trial, one lane at a time, and the same figures."""
-    ordered = mc.sorted_suite(suite)
-    plan = mc.LossModel(RecallModel("size"), burst)
-    found = mc.run_trials(ordered, [plan], TWO, 3, 7)[0][0, 0]
+    ordered = trials.sorted_suite(suite)
+    plan = trials.LossModel(RecallModel("size"), burst)
+    found = trials.run_trials(ordered, [plan], TWO, 3, 7)[0][0, 0]
     missed = {m.false_negative for m in found["selected"]}
     assert len(missed | {ordered.measure(TWO["selected"]).false_negative}) > 1
     for trial in range(3):
@@ -87,7 +89,7 @@ def test_a_trial_is_what_it_is_alone(suite: Suite, burst: float | None) -> None:
 def test_every_third_detection_or_so_is_lost_as_recall_says(suite: Suite) -> None:
     """Bursts are longer, yet as many detections are lost."""
     seen = suite.perception_results[1]
-    observed = mc.DetectableObjects(
+    observed = trials.DetectableObjects(
         "x", seen.observed_m, np.full(seen.area_px2.shape, 0.7), seen.present, seen.kind
     )
     for burst in (None, 5.0):
@@ -151,15 +153,15 @@ def test_loss_and_latency_together(suite: Suite) -> None:
 
 
 def test_summary_is_students() -> None:
-    told = mc.summarize([1.0, 2.0, 3.0, 4.0, math.nan])
+    told = trials.summarize([1.0, 2.0, 3.0, 4.0, math.nan])
     assert told["trials"] == 4
     assert told["mean"] == 2.5
     assert told["sd"] == pytest.approx(1.2909944)
     assert told["low"] == pytest.approx(2.5 - 3.1824463 * 1.2909944 / 2, abs=1e-6)
     assert told["high"] == pytest.approx(2.5 + 3.1824463 * 1.2909944 / 2, abs=1e-6)
     assert told["p2_5"] == pytest.approx(1.075)
-    assert mc.summarize([2.0])["low"] is None
-    assert mc.summarize([math.nan])["mean"] is None
+    assert trials.summarize([2.0])["low"] is None
+    assert trials.summarize([math.nan])["mean"] is None
 
 
 def test_recall_curve_files(tmp_path: Path) -> None:
@@ -171,7 +173,7 @@ def test_recall_curve_files(tmp_path: Path) -> None:
     }
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
-        assert mc.load_recall_curve(tmp_path / name) == wanted
+        assert load_recall_curve(tmp_path / name) == wanted
     bad = {
         "d.csv": "100,0.4\n90,0.5\n",
         "e.csv": "100,0.4\n",
@@ -184,9 +186,9 @@ def test_recall_curve_files(tmp_path: Path) -> None:
     for name, text in bad.items():
         (tmp_path / name).write_text(text)
         with pytest.raises(BikepedError, match=name):
-            mc.load_recall_curve(tmp_path / name)
+            load_recall_curve(tmp_path / name)
     with pytest.raises(BikepedError, match="recall-curve"):
-        mc.load_recall_curve(tmp_path / "missing.csv")
+        load_recall_curve(tmp_path / "missing.csv")
 
 
 def test_curve_is_used_and_comes_last(suite: Suite) -> None:

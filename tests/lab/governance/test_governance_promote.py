@@ -12,7 +12,7 @@ from bikeped.config import DecisionConfig, load_config
 from bikeped.config.candidate import parse_decision
 from bikeped.config.provenance import check_provenance, decision_hash
 from bikeped.errors import BikepedError, ConfigError
-from bikeped.lab.cli import conformance_governance as governance
+from bikeped.lab.cli.conformance import command as conformance
 from bikeped.lab.governance import promote as promoting
 from bikeped.lab.governance.gates import all_hold, check_gate_figures, check_gates
 from bikeped.lab.scenarios.scenario import load_scenarios
@@ -46,10 +46,8 @@ feedback:
 
 def run(*arguments):
     """Exit status of a governance command."""
-    group = click.Group("conformance")
-    governance.add_commands(group)
     try:
-        return group.main(args=[str(a) for a in arguments], standalone_mode=False) or 0
+        return conformance.main(args=[str(a) for a in arguments], standalone_mode=False) or 0
     except BikepedError as error:
         return error.exit_status
 

@@ -3,13 +3,12 @@
 import json
 import shlex
 
-import click
 import numpy as np
 import pytest
 
 from bikeped.config import DecisionConfig, load_config
 from bikeped.errors import BikepedError
-from bikeped.lab.cli import conformance_governance as governance
+from bikeped.lab.cli.conformance import command as conformance
 from bikeped.lab.governance import register
 from bikeped.lab.governance.audit_records import write_audit
 from bikeped.lab.governance.what_if import (
@@ -168,10 +167,8 @@ def test_a_bad_threshold_is_named(item):
 
 
 def run(*arguments):
-    group = click.Group("conformance")
-    governance.add_commands(group)
     try:
-        return group.main(args=[str(a) for a in arguments], standalone_mode=False) or 0
+        return conformance.main(args=[str(a) for a in arguments], standalone_mode=False) or 0
     except BikepedError as error:
         return error.exit_status
 

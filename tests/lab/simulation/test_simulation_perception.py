@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bikeped.lab.experiments.montecarlo import DetectableObjects
+from bikeped.lab.experiments.trials import DetectableObjects
 from bikeped.lab.simulation.perception import (
     AVERAGE_PRECISION,
     OVERALL_RECALL,

@@ -12,7 +12,7 @@ from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 from bikeped.config import DecisionConfig, rule_settings
 from bikeped.decision import Decider
 from bikeped.lab.experiments.latency import sweep
-from bikeped.lab.experiments.montecarlo import (
+from bikeped.lab.experiments.trials import (
     LossModel,
     simulate_suite_trials,
     sorted_suite,
