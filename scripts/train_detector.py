@@ -35,28 +35,27 @@ from bikeped.lab.rendering.random_scene import DEFAULT_MIX
 from bikeped.lab.training.augment import AugmentSettings, augment_data
 from bikeped.lab.training.coco import read_coco
 from bikeped.lab.training.crops import CropSettings
-from bikeped.lab.training.device import knows_bfloat16
-from bikeped.lab.training.drawn import DrawnSettings, draw_set
+from bikeped.lab.training.device import supports_bfloat16
+from bikeped.lab.training.drawn import DrawnSettings, draw_training_set
 from bikeped.lab.training.export import export_network
 from bikeped.lab.training.fit import FitSettings, fit
-from bikeped.lab.training.hard_negative_mining import AFTER, MiningSettings
+from bikeped.lab.training.hard_negative_mining import MINING_ROUNDS, MiningSettings
 from bikeped.lab.training.model_card import (
     DrawnTest,
-    by_light,
     choose_confidence,
     drawn_test,
     summary,
+    summary_by_light,
     sweep,
 )
-from bikeped.lab.training.model_card_bootstrap import spread
-from bikeped.lab.training.model_card_text import card_text
+from bikeped.lab.training.model_card_bootstrap import bootstrap_spread
+from bikeped.lab.training.model_card_text import render_card
 from bikeped.lab.training.network import SmallNet, multiply_adds, shift_scores
 from bikeped.lab.training.packing import PackSettings
-from bikeped.lab.training.quantise import PICTURES as STEPS_FROM
-from bikeped.lab.training.quantise import quantise, shown_pictures
-from bikeped.lab.training.small import SmallOrder, train_small
+from bikeped.lab.training.quantise import CALIBRATION_IMAGES, calibration_images, quantise
+from bikeped.lab.training.small import SmallTrainSettings, train_small
 from bikeped.lab.training.warp import WarpRanges
-from bikeped.lab.training.weights import load_weights
+from bikeped.lab.training.weights import SmallDetector, load_weights
 from bikeped.models import BUNDLED_FILE
 from bikeped.types import Kind
 
@@ -66,7 +65,7 @@ PICTURES, STEPS = 5000, 11200
 #: times a second. It learns on pictures 1280 across, made a little smaller and larger about this.
 SHOWN = (1152, 672)
 CROPS = CropSettings(scale=(0.8, 1.02))
-MINING = MiningSettings(after=AFTER)
+MINING = MiningSettings(after=MINING_ROUNDS)
 TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
 #: As many as that one street, of which come four, does not decide how many false ones there are.
 VALIDATION = (
@@ -120,22 +119,25 @@ def build(out: Path, pictures: int, steps: int) -> None:
     data = out / "data"
     if not (data / "annotations.json").is_file():
         began = time.monotonic()
-        draw_set(data, replace(TRAINING, pictures=pictures), loaded, counted("drawn", pictures))
+        draw_training_set(
+            data, replace(TRAINING, pictures=pictures), loaded, counted("drawn", pictures)
+        )
         drawing = {"seconds": round(time.monotonic() - began, 1), "mix": asdict(TRAINING.mix)}
         write_json(out / "drawing.json", drawing)
     training = out / "training"
     if not (training / "training.json").is_file():
         make_folder(training)
-        order = SmallOrder(steps=steps, device="cpu", crops=CROPS, mining=MINING)
+        order = SmallTrainSettings(steps=steps, device="cpu", crops=CROPS, mining=MINING)
         write_json(
             training / "training.json", train_small(read_coco(data), training, order, say=say)
         )
-    network, names, _, facts = load_weights(training / "weights.pt")
+    detector = replace(load_weights(training / "weights.pt"), size=SHOWN)
+    network, names = detector.network, detector.names
     # The score that becomes the default configuration's confidence; of the eight-bit network, which
     # is the one that most will run.
     whole = read_coco(data)
-    export_network(network, names, SHOWN, out / "plain.onnx", facts)
-    quantise(out / "plain.onnx", shown_pictures(whole, SHOWN), out / "plain-int8.onnx")
+    export_network(detector, out / "plain.onnx")
+    quantise(out / "plain.onnx", calibration_images(whole, SHOWN), out / "plain-int8.onnx")
     plain = DetectionConfig(model=str((out / "plain-int8.onnx").resolve()), confidence=0.04)
     validation = []
     for test in VALIDATION:
@@ -144,9 +146,9 @@ def build(out: Path, pictures: int, steps: int) -> None:
     chosen = [choose_confidence(validation, kind, GRID, MOST_FALSE[kind]) for kind in Kind]
     shipped = loaded.config.detection.confidence
     shift_scores(network, chosen, shipped)
-    exported = export_network(network, names, SHOWN, out / "small.onnx", facts)
+    exported = export_network(detector, out / "small.onnx")
     int8 = out / "small-int8.onnx"
-    int8_bytes = quantise(out / "small.onnx", shown_pictures(whole, SHOWN), int8)
+    int8_bytes = quantise(out / "small.onnx", calibration_images(whole, SHOWN), int8)
     model = shipped_as(loaded, int8)
     road = load_detector(model, Path("/"), road_region(loaded)).input_size
     card: dict[str, Any] = {
@@ -157,7 +159,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
             "int8_file": "small-int8.onnx",
             "int8_sha256": sha256_of(int8),
             "int8_bytes": int8_bytes,
-            "int8_pictures": STEPS_FROM,
+            "int8_pictures": CALIBRATION_IMAGES,
             "classes": list(names),
             "input": list(SHOWN),
             "weights": sum(p.numel() for p in network.parameters()),
@@ -185,7 +187,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
     if (out / "experiment.json").is_file():
         card["experiment"] = read(out / "experiment.json")
     write_json(out / "small.json", card)
-    write_whole(out / "small.md", card_text(card))
+    write_whole(out / "small.md", render_card(card))
     say(f"wrote {out / 'small.onnx'}, small-int8.onnx, small.json, small.md")
 
 
@@ -205,8 +207,8 @@ def measured(folder: Path, loaded: LoadedConfig) -> dict[str, Any]:
             sections[name + end] = {
                 "seed": test.seed,
                 **numbers,
-                "spread": spread(seen, shipped),
-                "lights": by_light(seen, lights, shipped),
+                "spread": bootstrap_spread(seen, shipped),
+                "lights": summary_by_light(seen, lights, shipped),
             }
     return sections
 
@@ -217,7 +219,7 @@ def measure_again() -> None:
     card = read(folder / "small.json") | measured(folder, load_config(None))
     card["made"]["measured"] = commit()
     write_json(folder / "small.json", card)
-    write_whole(folder / "small.md", card_text(card))
+    write_whole(folder / "small.md", render_card(card))
     say(f"wrote {folder / 'small.json'}, small.md")
 
 
@@ -237,7 +239,7 @@ def experiment(out: Path) -> None:
     held_out = DrawnSettings(400, seed=22, configured=0, large=0)
     for name, settings in (("ordinary", ordinary), ("held-out", held_out)):
         if not (folder / name / "annotations.json").is_file():
-            draw_set(folder / name, settings, loaded, counted(name, settings.pictures))
+            draw_training_set(folder / name, settings, loaded, counted(name, settings.pictures))
     if not (folder / "augmented" / "annotations.json").is_file():
         # As wide as the held-out pictures, so that objects keep their size.
         order = AugmentSettings(WarpRanges(size_px=960), 0, 1, 0.3, 2)
@@ -258,10 +260,11 @@ def experiment(out: Path) -> None:
                 pictures=4,
                 crops=CropSettings(view=view, scale=(0.85, 1.4)),
                 pack=PackSettings(squares=8),
-                bfloat16=knows_bfloat16("cpu"),
+                bfloat16=supports_bfloat16("cpu"),
             )
             fitted = fit(read_coco(folder / name), order_of_fit, say=say)
-            export_network(fitted.network, fitted.names, (960, 544), model, {"experiment": name})
+            detector = SmallDetector(fitted.network, fitted.names, (960, 544), {"experiment": name})
+            export_network(detector, model)
             write_json(folder / f"{name}.json", {"seconds": round(fitted.seconds, 1)})
         lines[name] = read(folder / f"{name}.json")
     report = folder / "evaluation.json"

@@ -14,7 +14,7 @@ from bikeped.detection import load_detector
 from bikeped.detection.model_hash import sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
-from bikeped.lab.training.model_card_text import reached
+from bikeped.lab.training.model_card_text import meets_target
 from bikeped.models import (
     BUNDLED,
     BUNDLED_FILE,
@@ -63,8 +63,8 @@ def test_the_card_says_whether_its_aim_is_reached(card):
     test = card["configured_camera"]
     assert test["confidence"] == load_config(None).config.detection.confidence
     text = BUNDLED_FILE.with_suffix(".md").read_text()
-    assert ("**Reached.**" in text) == reached(test)
-    assert ("**It falls short:**" in text) != reached(test)
+    assert ("**Reached.**" in text) == meets_target(test)
+    assert ("**It falls short:**" in text) != meets_target(test)
     # A model that is worse than the one before is no progress.
     for kind, least in (("pedestrian", 0.95), ("cyclist", 0.95)):
         assert test["kinds"][kind]["within_15_m"]["recall"] >= least

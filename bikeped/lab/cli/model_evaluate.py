@@ -23,7 +23,7 @@ from bikeped.lab.cli.conformance_shared import print_table
 if TYPE_CHECKING:
     from bikeped.lab.result_tables import CellValue, ResultTable
     from bikeped.lab.training.evaluate import Evaluation
-    from bikeped.lab.training.measures import Row
+    from bikeped.lab.training.measures import ClassMeasures
 
 
 @click.command("evaluate")
@@ -217,7 +217,7 @@ def _distances(result: Evaluation) -> ResultTable:
 
 
 def _compared(
-    result: Evaluation, rows: list[list[tuple[str, Row]]]
+    result: Evaluation, rows: list[list[tuple[str, ClassMeasures]]]
 ) -> tuple[tuple[str, ...], list[tuple[CellValue, ...]]]:
     """Columns and rows: AP, AP50 and recall of each model, and AP against the first model's."""
     columns = ["", "objects"]

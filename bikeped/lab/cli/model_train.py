@@ -109,18 +109,18 @@ def command(
     given += [("--weights", weights)] if weights is not None else []
     check_outputs(given, [("--out", name) for name in names])
     if network == "small":
-        from bikeped.lab.training.hard_negative_mining import AFTER, MiningSettings
-        from bikeped.lab.training.small import SmallOrder, train_small
+        from bikeped.lab.training.hard_negative_mining import MINING_ROUNDS, MiningSettings
+        from bikeped.lab.training.small import SmallTrainSettings, train_small
 
         _refuse(validation, "--validation")
         _refuse(weights, "--weights")
         count = steps or -(-epochs * len(source.images) // batch)
-        mining = MiningSettings(after=AFTER if mine else ())
-        order = SmallOrder(count, batch, seed, device, mining=mining)
+        mining = MiningSettings(after=MINING_ROUNDS if mine else ())
+        order = SmallTrainSettings(count, batch, seed, device, mining=mining)
         with progress_bar("train", count) as progress:
             summary = train_small(source, out, order, progress)
     else:
-        from bikeped.lab.training.yolo import YoloOrder, train_yolo
+        from bikeped.lab.training.yolo import YoloTrainSettings, train_yolo
 
         if mine:
             raise click.UsageError("--mine is for --network small; leave it out with a YOLO")
@@ -128,7 +128,7 @@ def command(
             source,
             None if validation is None else read_coco(validation),
             out,
-            YoloOrder(network, size, epochs, batch, weights, device, workers, seed),
+            YoloTrainSettings(network, size, epochs, batch, weights, device, workers, seed),
         )
     write_json(summary, str(out / "training.json"))
     if json_path is not None:

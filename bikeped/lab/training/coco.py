@@ -28,7 +28,7 @@ from bikeped.types import FloatArray, ImageArray
 _JPEG = b"\xff\xd8"
 _LARGEST_SIDE = 32768
 #: Among the furniture of an image: false detections of a network (`hard_negative_mining`).
-MISTAKEN = "mistaken"
+FALSE_POSITIVE = "mistaken"
 Box = tuple[float, float, float, float]  #: x1, y1, x2, y2 in pixels of a picture
 
 

@@ -17,13 +17,20 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.preprocess import PAD, Letterbox
 from bikeped.errors import CaptureError, DataSetError
-from bikeped.lab.training.coco import MISTAKEN, Box, CocoData, CocoImage, furniture, read_picture
+from bikeped.lab.training.coco import (
+    FALSE_POSITIVE,
+    Box,
+    CocoData,
+    CocoImage,
+    furniture,
+    read_picture,
+)
 from bikeped.types import FloatArray, ImageArray, IntArray
 
 _LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
 _LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
 _WHOLE = 0.97  #: of an object that shows, or it is hidden in part
-_TURNS_OF_HIDDEN = 4
+_OCCLUDED_WEIGHT = 4
 LARGEST_WINDOW_PX = 256  #: of those whose size is asked for one by one
 _NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest in grey levels
 
@@ -55,7 +62,7 @@ class Crop:
 
 
 @dataclass(frozen=True)
-class View:
+class Sample:
     """A whole picture at the network's size, letterboxed: `rgb` [h, w, 3] and what is in it."""
 
     rgb: ImageArray
@@ -68,13 +75,13 @@ class View:
     hidden: frozenset[int] = frozenset()
 
     @property
-    def mistaken_px(self) -> FloatArray:
+    def false_positive_px(self) -> FloatArray:
         """Boxes [n, 4] of what a network took for somebody and is nobody."""
-        return self.furniture_px.get(MISTAKEN, np.zeros((0, 4)))
+        return self.furniture_px.get(FALSE_POSITIVE, np.zeros((0, 4)))
 
-    def turns(self, index: int) -> int:
+    def sampling_weight(self, index: int) -> int:
         """How often an object is drawn lots for: who is hidden in part is rarer, and harder."""
-        return _TURNS_OF_HIDDEN if index in self.hidden else 1
+        return _OCCLUDED_WEIGHT if index in self.hidden else 1
 
 
 def class_ids(data: CocoData) -> dict[int, int]:
@@ -82,7 +89,7 @@ def class_ids(data: CocoData) -> dict[int, int]:
     return {category: number for number, category in enumerate(data.categories)}
 
 
-def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
+def read_sample(data: CocoData, image: CocoImage, size: tuple[int, int]) -> Sample:
     """A picture as a network of input `size` (width, height) sees it; DataSetError as `coco`'s."""
     fit = Letterbox.fit(image.width, image.height, size, "ultralytics")
     rgb = np.full((size[1], size[0], 3), PAD, np.uint8)
@@ -92,7 +99,7 @@ def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
     found = data.objects[image.id]
     box = np.array([o.box_px for o in found], np.float64).reshape(-1, 4)
     known = class_ids(data)
-    return View(
+    return Sample(
         rgb,
         fit.forward(box).astype(np.float64),
         np.array([known[o.category_id] for o in found], np.int64),
@@ -103,14 +110,14 @@ def read_view(data: CocoData, image: CocoImage, size: tuple[int, int]) -> View:
 
 
 def _furniture(image: CocoImage, fit: Letterbox) -> dict[str, FloatArray]:
-    """The boxes of every kind of thing in view pixels."""
+    """The boxes of every kind of thing in sample pixels."""
     found: dict[str, list[Box]] = {}
     for what, box in furniture(image):
         found.setdefault(what, []).append(box)
     return {what: fit.forward(np.array(boxes)).astype(np.float64) for what, boxes in found.items()}
 
 
-def usual_places(data: CocoData, size: tuple[int, int]) -> FloatArray:
+def object_centres(data: CocoData, size: tuple[int, int]) -> FloatArray:
     """Middles [n, 2] of every object of the data set, in pixels of views of `size`."""
     middles: list[FloatArray] = [np.zeros((0, 2))]
     for image in data.images:
@@ -133,11 +140,11 @@ def reduced_picture(image: CocoImage, width: int, height: int) -> ImageArray:
         return read_picture(image)  # a PNG by a JPEG's name, or it says what is wrong
 
 
-class Cutter:
+class Cropper:
     """Cuts windows by `CropSettings`; holds what does not change from window to window."""
 
     def __init__(self, settings: CropSettings, seed: int, usual_px: FloatArray) -> None:
-        """`usual_px` [n, 2]: middles of objects in all of the pictures, in pixels of the view."""
+        """`usual_px` [n, 2]: middles of objects in all of the pictures, in pixels of the sample."""
         self._settings = settings
         width, height = (max(side, LARGEST_WINDOW_PX) for side in settings.window)
         random = np.random.default_rng([seed, 1])
@@ -149,21 +156,20 @@ class Cutter:
 
     def __call__(
         self,
-        view: View,
+        sample: Sample,
         random: np.random.Generator,
         window: tuple[int, int] | None = None,
         around: FloatArray | None = None,
         scale: float | None = None,
     ) -> Crop:
-        """One window of `view`; of another size than the settings' where `window` says so.
+        """One window of `sample`; `window` and `scale` replace what the settings give.
 
-        `around`: the box [4] in pixels of the view that it must hold as far as it fits, or an empty
-        array for none (somewhere where some other picture has an object); None leaves it to the
-        settings.
+        `around`: a box [4] in pixels of the sample that the window must hold as far as it fits; an
+        empty array for a place where other pictures have objects; None leaves it to the settings.
         """
         width, height = window or self._settings.window
         scale = float(random.uniform(*self._settings.scale)) if scale is None else scale
-        left, top = self._corner(view, width / scale, height / scale, random, around)
+        left, top = self._corner(sample, width / scale, height / scale, random, around)
         flip = random.random() < self._settings.flip
         move = np.array([[scale, 0.0, -left * scale], [0.0, scale, -top * scale]])
         if flip:
@@ -174,7 +180,7 @@ class Cutter:
         warp[:, 2] += middle
         rgb = np.asarray(
             cv2.warpAffine(
-                view.rgb,
+                sample.rgb,
                 warp,
                 (width, height),
                 flags=cv2.INTER_LINEAR,
@@ -183,29 +189,31 @@ class Cutter:
             ),
             np.uint8,
         )
-        box = view.box_px * scale - np.array([left, top, left, top]) * scale
+        box = sample.box_px * scale - np.array([left, top, left, top]) * scale
         if flip:
             box[:, [0, 2]] = width - box[:, [2, 0]]
-        crop = _sorted_out(rgb, box, view, (width, height))
+        crop = _window_labels(rgb, box, sample, (width, height))
         if random.random() < self._settings.cover and len(crop.box_px):
-            _cover(crop, random)
+            _occlude(crop, random)
         if random.random() < self._settings.light:
-            return Crop(self._relit(crop.rgb, random), crop.box_px, crop.class_id, crop.ignored_px)
+            return Crop(
+                self._relight(crop.rgb, random), crop.box_px, crop.class_id, crop.ignored_px
+            )
         return crop
 
     def _corner(
         self,
-        view: View,
+        sample: Sample,
         wide: float,
         high: float,
         random: np.random.Generator,
         around: FloatArray | None,
     ) -> tuple[float, float]:
-        """Upper left corner of a window of `wide` x `high` pixels of the view."""
+        """Upper left corner of a window of `wide` x `high` pixels of the sample."""
         across, down = self._settings.view
-        count = len(view.box_px)
+        count = len(sample.box_px)
         kind = random.random() - self._settings.around_object
-        mistaken = view.mistaken_px
+        mistaken = sample.false_positive_px
         if around is not None:
             kind = 0.0  # where objects use to be, if not around this one
         elif len(mistaken) and random.random() < self._settings.around_mistaken:
@@ -217,10 +225,10 @@ class Cutter:
             left, top = box[:2] - random.uniform(0, 1, 2) * slack
         elif count and kind < 0:
             # First the class, then the object: parked cars must not crowd out who walks.
-            kinds = np.unique(view.class_id)
-            mine = np.flatnonzero(view.class_id == kinds[int(random.integers(len(kinds)))])
-            mine = np.repeat(mine, [view.turns(int(index)) for index in mine])
-            box = view.box_px[mine[int(random.integers(len(mine)))]]
+            kinds = np.unique(sample.class_id)
+            mine = np.flatnonzero(sample.class_id == kinds[int(random.integers(len(kinds)))])
+            mine = np.repeat(mine, [sample.sampling_weight(int(index)) for index in mine])
+            box = sample.box_px[mine[int(random.integers(len(mine)))]]
             middle = (box[:2] + box[2:]) / 2
             left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)
         elif len(self._usual) and kind < self._settings.around_usual:
@@ -228,13 +236,13 @@ class Cutter:
             left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)
         else:
             left, top = random.uniform(0, 1, 2) * (across - wide, down - high)
-        # The window stays on the view as far as it fits, as the camera's picture does.
+        # The window stays on the sample as far as it fits, as the camera's picture does.
         return (
             float(np.clip(left, min(0, across - wide), max(0, across - wide))),
             float(np.clip(top, min(0, down - high), max(0, down - high))),
         )
 
-    def _relit(self, rgb: ImageArray, random: np.random.Generator) -> ImageArray:
+    def _relight(self, rgb: ImageArray, random: np.random.Generator) -> ImageArray:
         """Another exposure, white balance, contrast, blur and noise."""
         value = np.arange(256) / 255.0
         gamma = np.exp(random.uniform(-0.25, 0.25))
@@ -254,7 +262,7 @@ class Cutter:
         return out
 
 
-def _sorted_out(rgb: ImageArray, box: FloatArray, view: View, size: tuple[int, int]) -> Crop:
+def _window_labels(rgb: ImageArray, box: FloatArray, sample: Sample, size: tuple[int, int]) -> Crop:
     """Which objects are in the window, and which of them cannot be asked for."""
     width, height = size
     inside = np.clip(box, 0, (width, height, width, height))
@@ -263,11 +271,11 @@ def _sorted_out(rgb: ImageArray, box: FloatArray, view: View, size: tuple[int, i
     left = np.prod(np.maximum(side, 0), axis=1)
     seen = left > 0
     good = seen & (left >= _LEAST_SHARE * area) & (side.max(axis=1) >= _LEAST_SIDE_PX)
-    good &= (side.min(axis=1) >= _LEAST_SIDE_PX / 2) & (view.crowd == 0)
-    return Crop(rgb, inside[good], view.class_id[good], inside[seen & ~good])
+    good &= (side.min(axis=1) >= _LEAST_SIDE_PX / 2) & (sample.crowd == 0)
+    return Crop(rgb, inside[good], sample.class_id[good], inside[seen & ~good])
 
 
-def _cover(crop: Crop, random: np.random.Generator) -> None:
+def _occlude(crop: Crop, random: np.random.Generator) -> None:
     """Paints a plain patch over up to a quarter of an object, in place."""
     box = crop.box_px[int(random.integers(len(crop.box_px)))]
     share = random.uniform(0.2, 0.5, 2)

@@ -9,7 +9,7 @@ import torch
 from bikeped.errors import DetectorError
 
 
-def named_device(asked: str) -> str:
+def resolve_device(asked: str) -> str:
     """PyTorch's name of the device `asked`: `auto`, `cpu`, or a GPU's number; DetectorError."""
     if asked == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
@@ -24,7 +24,7 @@ def named_device(asked: str) -> str:
     return device
 
 
-def knows_bfloat16(device: str) -> bool:
+def supports_bfloat16(device: str) -> bool:
     """Whether it multiplies bfloat16 itself (of processors: AVX-512 BF16, AMX, or Arm's BF16)."""
     if torch.device(device).type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))

@@ -50,7 +50,7 @@ class DrawnSettings:
     processes: int = 2
 
 
-def draw_set(
+def draw_training_set(
     folder: Path,
     settings: DrawnSettings,
     loaded: LoadedConfig,

@@ -40,16 +40,16 @@ from bikeped.files import write_whole
 from bikeped.lab.training.coco import CocoData, read_picture
 from bikeped.lab.training.ground_truth import (
     INPUT_PX,
-    joined_truth,
+    category_truth,
     kinds_by_name,
     plain_name,
-    truth_of,
+    road_user_truth,
 )
 from bikeped.lab.training.measures import (
-    Curve,
-    Found,
+    DetectionSet,
+    GroundTruth,
     Measures,
-    Truth,
+    RecallCurve,
     measure,
     recall_by_distance,
     recall_curve,
@@ -57,7 +57,7 @@ from bikeped.lab.training.measures import (
 from bikeped.types import Detections, Kind
 
 KIND_NAMES = tuple(kind.label for kind in Kind)
-_MOST_OF_A_PICTURE = 300  # more than the measures read
+_MAX_DETECTIONS = 300  # more than the measures read
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class ModelUnderTest:
 
 
 @dataclass(frozen=True)
-class Scores:
+class ModelScores:
     """Everything measured of one model."""
 
     label: str
@@ -87,8 +87,8 @@ class Scores:
     classes: Measures | None  #: None where model and data share no class
     merged: Measures
     road_users: Measures
-    curve: Curve
-    curves: dict[str, Curve]  #: the same by kind
+    curve: RecallCurve
+    curves: dict[str, RecallCurve]  #: the same by kind
     by_distance: dict[str, list[dict[str, Any]]]  #: of road users, by kind
 
 
@@ -98,7 +98,7 @@ class Evaluation:
 
     data: dict[str, Any]
     settings: dict[str, Any]
-    scores: tuple[Scores, ...]
+    scores: tuple[ModelScores, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -186,7 +186,7 @@ def evaluate(
         )
     known = [{plain_name(name) for name in model.detector.class_names} for model in models]
     shared = [i for i, name in data.categories.items() if all(plain_name(name) in k for k in known)]
-    gathered = [_Gathered(model, data, shared, detection, settings) for model in models]
+    gathered = [_ModelResults(model, data, shared, detection, settings) for model in models]
     for done, image in enumerate(data.images):
         picture = read_picture(image)
         scale = INPUT_PX / max(image.width, image.height)
@@ -197,9 +197,9 @@ def evaluate(
             its.add(done, users, every, scale)
         progress(done + 1)
     truths = (
-        truth_of(data, {category: n for n, category in enumerate(shared)}),
-        truth_of(data, {category: int(kind) for category, kind in kind_of.items()}),
-        joined_truth(data, kind_of, detection),
+        category_truth(data, {category: n for n, category in enumerate(shared)}),
+        category_truth(data, {category: int(kind) for category, kind in kind_of.items()}),
+        road_user_truth(data, kind_of, detection),
     )
     names = [data.categories[category] for category in shared]
     return Evaluation(
@@ -227,7 +227,7 @@ def evaluate(
     )
 
 
-def write_curve(path: Path, curve: Curve, at_iou_50: bool = False) -> None:
+def write_curve(path: Path, curve: RecallCurve, at_iou_50: bool = False) -> None:
     """Writes a recall curve as the conformance simulation reads it with `--recall-curve`.
 
     CSV, or JSON where the name ends so. `at_iou_50` writes recall at IoU 0.50 instead of the mean
@@ -248,7 +248,7 @@ def write_curve(path: Path, curve: Curve, at_iou_50: bool = False) -> None:
     write_whole(path, "\n".join(["area_px2,recall", *lines]) + "\n")
 
 
-class _Gathered:
+class _ModelResults:
     """What one model found in all pictures, for the three readings."""
 
     def __init__(
@@ -274,23 +274,23 @@ class _Gathered:
             group = group_of[every.class_id]
             wanted = group >= 0
             box, score, group = every.box[wanted], every.score[wanted], group[wanted]
-            keep = non_max_suppression(box, score, group, self._iou, _MOST_OF_A_PICTURE)
+            keep = non_max_suppression(box, score, group, self._iou, _MAX_DETECTIONS)
             self._parts[part].append(_Part(image, group[keep], box[keep] * scale, score[keep]))
         kind = users.kind.astype(np.int64)
         self._parts[2].append(_Part(image, kind, users.box_px * scale, users.confidence))
 
     def score(
         self,
-        truths: tuple[Truth, Truth, Truth],
+        truths: tuple[GroundTruth, GroundTruth, GroundTruth],
         names: Sequence[str],
         images: int,
         settings: EvaluationSettings,
-    ) -> Scores:
+    ) -> ModelScores:
         """Measures everything that was added."""
-        found = [_all_of(parts) for parts in self._parts]
+        found = [_concatenated(parts) for parts in self._parts]
         users = measure(truths[2], found[2], KIND_NAMES, images)
         detector = self._model.detector
-        return Scores(
+        return ModelScores(
             self._model.label,
             {
                 "file": str(self._model.path),
@@ -318,9 +318,9 @@ class _Part:
     score: Any
 
 
-def _all_of(parts: Sequence[_Part]) -> Found:
+def _concatenated(parts: Sequence[_Part]) -> DetectionSet:
     none = [np.zeros(0)]
-    return Found(
+    return DetectionSet(
         np.concatenate([np.full(len(p.score), p.image) for p in parts] or none).astype(np.int64),
         np.concatenate([p.category for p in parts] or none).astype(np.int64),
         np.concatenate([p.box_px for p in parts] or [np.zeros((0, 4))]).astype(np.float64),

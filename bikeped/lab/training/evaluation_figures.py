@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from bikeped.lab.plotting import SERIES, FigureSheet, escape_dollars, to_floats
-from bikeped.lab.training.evaluate import Evaluation, Scores
-from bikeped.lab.training.measures import Row
+from bikeped.lab.training.evaluate import Evaluation, ModelScores
+from bikeped.lab.training.measures import ClassMeasures
 
 _TICKS = (4, 8, 16, 32, 64, 96, 128, 256, 512, 1024)  # sides of squares on the axis of areas
 
 
-def evaluation_rows(score: Scores) -> list[tuple[str, Row]]:
+def evaluation_rows(score: ModelScores) -> list[tuple[str, ClassMeasures]]:
     """The rows of the table that people read: all classes, then the three kinds, both ways."""
     rows = []
     if score.classes is not None:
@@ -85,7 +85,7 @@ def _bars(sheet: FigureSheet, evaluation: Evaluation, panel: int, what: str) -> 
     axes.grid(False, axis="y")
 
 
-def _curves(sheet: FigureSheet, scores: Sequence[Scores], panel: int) -> None:
+def _curves(sheet: FigureSheet, scores: Sequence[ModelScores], panel: int) -> None:
     axes = sheet.axes[panel]
     for number, score in enumerate(scores):
         colour, marker, _ = SERIES[number % len(SERIES)]

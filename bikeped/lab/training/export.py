@@ -1,7 +1,7 @@
-"""From weights to what bikeped runs: an ONNX file with its facts inside, a TensorRT engine.
+"""Exports weights to ONNX.
 
-The facts (class names, input size, task) are written as Ultralytics writes them, which is what
-`bikeped.detection` reads: text in the ONNX metadata, JSON in front of an engine.
+Class names, input size and task go into the file's metadata as text, as Ultralytics writes them and
+`bikeped.detection` reads them.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import torch
 from bikeped import __version__
 from bikeped.errors import DetectorError
 from bikeped.files import write_whole
-from bikeped.lab.training.network import STRIDES, Exported, SmallNet
+from bikeped.lab.training.network import STRIDES, ExportModule
 from bikeped.lab.training.onnx_file import compare, with_metadata
-from bikeped.lab.training.weights import is_small, load_weights
+from bikeped.lab.training.weights import SmallDetector, is_small, load_weights
 
 _OPSET = 17
 
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """What was written and how far its answers are from PyTorch's."""
+    """The file, and how much its output differs from PyTorch's."""
 
     path: Path
     bytes: int
@@ -50,25 +50,18 @@ class ExportSummary:
 
 
 def export_weights(weights: Path, out: Path) -> ExportSummary:
-    """Writes the small network's weights as ONNX. Raises DetectorError where that fails."""
-    network, names, size, facts = load_weights(weights)
-    return export_network(network, names, size, out, facts)
+    """Exports a weight file of the small network. Raises DetectorError where that fails."""
+    return export_network(load_weights(weights), out)
 
 
-def export_network(
-    network: SmallNet,
-    names: tuple[str, ...],
-    size: tuple[int, int],
-    out: Path,
-    facts: dict[str, Any],
-) -> ExportSummary:
-    """Writes `network` as ONNX and holds its answers against PyTorch's, before the file is there.
+def export_network(detector: SmallDetector, out: Path) -> ExportSummary:
+    """Writes the small network as ONNX after comparing its output with PyTorch's.
 
-    `size` is width and height of the input that is told in the metadata; it takes any multiples of
-    32. `facts` go into the metadata as JSON.
+    The model takes any input size in multiples of 32; the metadata name `detector.size`, and hold
+    `detector.facts` as JSON. Raises DetectorError where the outputs differ.
     """
-    width, height = size
-    whole = Exported(network.eval()).eval()
+    width, height = detector.size
+    whole = ExportModule(detector.network.eval()).eval()
     generator = torch.Generator().manual_seed(0)
     picture = torch.rand((1, 3, height, width), generator=generator)
     file = io.BytesIO()
@@ -90,28 +83,28 @@ def export_network(
         {
             "author": f"bikeped {__version__}",
             "task": "detect",
-            "names": repr(dict(enumerate(names))),
+            "names": repr(dict(enumerate(detector.names))),
             "imgsz": repr([height, width]),
             "stride": str(STRIDES[-1]),
-            "bikeped": json.dumps(facts, sort_keys=True),
+            "bikeped": json.dumps(detector.facts, sort_keys=True),
         },
     )
     box = score = 0.0
-    # Of other sides, too: the traced network must not have kept this picture's.
+    # A second size shows that the trace has not fixed the first one.
     for shown in (picture, picture[:, :, : max(STRIDES[-1], height // 2 // 32 * 32)]):
         with torch.no_grad():
             expected = whole(shown).numpy()
         apart = compare(content, shown.contiguous().numpy(), expected, str(out))
         box, score = max(box, apart[0]), max(score, apart[1])
     write_whole(out, content)
-    return ExportSummary(out, len(content), names, size, box, score)
+    return ExportSummary(out, len(content), detector.names, detector.size, box, score)
 
 
 def export_any(weights: Path, out: Path, size: int, int8: Path | None = None) -> dict[str, Any]:
-    """Exports whatever `model train` wrote: the small network's weights, or a YOLO's (`size`).
+    """Exports the weights of either network of `model train`; `size` is a YOLO's input side.
 
-    `int8`: a data set from whose pictures the steps of eight-bit numbers are taken; the small
-    network only. Raises DetectorError and DataSetError.
+    `int8`: data set to calibrate the eight-bit steps with; the small network only. Raises
+    DetectorError and DataSetError.
     """
     if is_small(weights):
         summary = export_weights(weights, out) if int8 is None else _in_int8(weights, out, int8)
@@ -128,10 +121,10 @@ def export_any(weights: Path, out: Path, size: int, int8: Path | None = None) ->
 
 def _in_int8(weights: Path, out: Path, data: Path) -> ExportSummary:
     from bikeped.lab.training.coco import read_coco
-    from bikeped.lab.training.quantise import quantise, shown_pictures
+    from bikeped.lab.training.quantise import calibration_images, quantise
 
     pictures = read_coco(data)
     with tempfile.TemporaryDirectory() as folder:
         summary = export_weights(weights, Path(folder) / "float.onnx")
-        shown = shown_pictures(pictures, summary.size)
+        shown = calibration_images(pictures, summary.size)
         return replace(summary, path=out, bytes=quantise(summary.path, shown, out))

@@ -23,14 +23,14 @@ from bikeped.lab.training.coco import CocoData
 from bikeped.lab.training.crops import (
     LARGEST_WINDOW_PX,
     Crop,
+    Cropper,
     CropSettings,
-    Cutter,
-    View,
-    read_view,
-    usual_places,
+    Sample,
+    object_centres,
+    read_sample,
 )
-from bikeped.lab.training.hard_negative_mining import MiningSettings, with_mistakes
-from bikeped.lab.training.loss import Truth, detection_loss
+from bikeped.lab.training.hard_negative_mining import MiningSettings, mine_false_positives
+from bikeped.lab.training.loss import ImageLabels, detection_loss
 from bikeped.lab.training.muon import Muon
 from bikeped.lab.training.network import STRIDES, SmallNet, grid
 from bikeped.lab.training.packing import BLOCK_PX, Packer, PackSettings
@@ -56,7 +56,7 @@ class FitSettings:
     workers: int = 2  #: threads, each with its part of every step
     #: The squares' convolutions in 16 bits: four fifths of the time on what knows it, six times as
     #: long on what does not. The loss and the steps that see no squares are float32, as what ships
-    #: is. `device.knows_bfloat16` tells.
+    #: is. `device.supports_bfloat16` tells.
     bfloat16: bool = False
     device: str = "cpu"
     crops: CropSettings = field(default_factory=CropSettings)
@@ -65,7 +65,7 @@ class FitSettings:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FitResult:
     """The trained network, what it knows, and how it came to be."""
 
     network: SmallNet
@@ -81,7 +81,7 @@ def fit(
     settings: FitSettings,
     progress: Callable[[int], None] = lambda done: None,
     say: Callable[[str], None] = lambda line: None,
-) -> Fitted:
+) -> FitResult:
     """Trains on `data`; `progress` takes the steps done. Raises DataSetError for unusable data."""
     _check(data, settings)
     began = time.monotonic()
@@ -108,7 +108,7 @@ def fit(
             for done in ready:
                 done.result()
             if step in looks:
-                mined, count = with_mistakes(
+                mined, count = mine_false_positives(
                     copy.deepcopy(mean).cpu(), data, shown_size(settings.crops), settings.mining
                 )
                 mistakes.append(count)
@@ -135,7 +135,7 @@ def fit(
                 sums = {}
                 spent = time.monotonic() - began
                 say(f"step {step + 1} of {settings.steps}, {spent:.0f} s: {losses[-1]}")
-    return Fitted(
+    return FitResult(
         mean.cpu().eval(),
         tuple(data.categories.values()),
         settings.crops.view,
@@ -174,15 +174,15 @@ class _Worker:
     """
 
     def __init__(
-        self, network: SmallNet, data: CocoData, settings: FitSettings, part: int, cutter: Cutter
+        self, network: SmallNet, data: CocoData, settings: FitSettings, part: int, cropper: Cropper
     ) -> None:
         self.network = network
         self.data = data  #: read from the next `prepare` on
-        self._settings, self._part, self._cutter = settings, part, cutter
+        self._settings, self._part, self._cropper = settings, part, cropper
         self._device = next(network.parameters()).device
-        self._packer = Packer(settings.pack, settings.crops, cutter)
-        self._pool: list[View] = []
-        self._ready: tuple[torch.Tensor, list[Truth]] = (torch.zeros(0), [])
+        self._packer = Packer(settings.pack, settings.crops, cropper)
+        self._pool: list[Sample] = []
+        self._ready: tuple[torch.Tensor, list[ImageLabels]] = (torch.zeros(0), [])
         self._packed = True
 
     def prepare(self, step: int) -> None:
@@ -228,15 +228,15 @@ class _Worker:
         mine = range(step * settings.pictures, (step + 1) * settings.pictures)
         self._pool = []
         return [
-            self._cutter(view, random)
+            self._cropper(view, random)
             for view in self._views(mine)
             for _ in range(settings.windows)
         ]
 
-    def _views(self, numbers: range) -> list[View]:
+    def _views(self, numbers: range) -> list[Sample]:
         """This part's share of the pictures `numbers`."""
         return [
-            read_view(self.data, self.data.images[self._picture(n)], self._settings.crops.view)
+            read_sample(self.data, self.data.images[self._picture(n)], self._settings.crops.view)
             for n in numbers[self._part :: self._settings.workers]
         ]
 
@@ -249,14 +249,14 @@ class _Worker:
 
 def _workers(network: SmallNet, data: CocoData, settings: FitSettings) -> list[_Worker]:
     """The first one's network is `network` itself; the others share its weights."""
-    cutter = Cutter(settings.crops, settings.seed, usual_places(data, settings.crops.view))
+    cropper = Cropper(settings.crops, settings.seed, object_centres(data, settings.crops.view))
     copies = [network]
     for _ in range(settings.workers - 1):
         other = copy.deepcopy(network)
         for own, shared in zip(other.parameters(), network.parameters(), strict=True):
             own.data = shared.data
         copies.append(other)
-    return [_Worker(n, data, settings, part, cutter) for part, n in enumerate(copies)]
+    return [_Worker(n, data, settings, part, cropper) for part, n in enumerate(copies)]
 
 
 def _join(network: SmallNet, workers: list[_Worker]) -> None:
@@ -276,12 +276,12 @@ def _join(network: SmallNet, workers: list[_Worker]) -> None:
                     other.copy_(own)
 
 
-def _tensors(crops: list[Crop], device: torch.device) -> tuple[torch.Tensor, list[Truth]]:
+def _tensors(crops: list[Crop], device: torch.device) -> tuple[torch.Tensor, list[ImageLabels]]:
     stacked = torch.from_numpy(np.stack([crop.rgb for crop in crops])).to(device)
     # Channels last in memory is how the pictures lie already: this moves no bytes.
     pictures = stacked.permute(0, 3, 1, 2).float() / 255
     truths = [
-        Truth(
+        ImageLabels(
             torch.from_numpy(crop.box_px).float().to(device),
             torch.from_numpy(crop.class_id).to(device),
             torch.from_numpy(crop.ignored_px).float().to(device),

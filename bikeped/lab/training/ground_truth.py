@@ -15,7 +15,7 @@ from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.classes import WITH_RIDER
 from bikeped.detection.riders import join_riders
 from bikeped.lab.training.coco import CocoData, CocoImage, CocoObject
-from bikeped.lab.training.measures import Truth
+from bikeped.lab.training.measures import GroundTruth
 from bikeped.types import Detections, Kind
 
 #: Side of the network input that areas are measured at (definitions, section 3).
@@ -36,9 +36,9 @@ def kinds_by_name(names: Mapping[int, str], detection: DetectionConfig) -> dict[
     return {i: wanted[plain_name(name)] for i, name in names.items() if plain_name(name) in wanted}
 
 
-def truth_of(data: CocoData, group_of: Mapping[int, int]) -> Truth:
+def category_truth(data: CocoData, group_of: Mapping[int, int]) -> GroundTruth:
     """The data's boxes, their categories mapped by `group_of`; others are left out."""
-    rows = _Rows()
+    rows = _TruthBuilder()
     for number, picture in enumerate(data.images):
         for thing in data.objects[picture.id]:
             if thing.category_id in group_of:
@@ -46,9 +46,11 @@ def truth_of(data: CocoData, group_of: Mapping[int, int]) -> Truth:
     return rows.truth()
 
 
-def joined_truth(data: CocoData, kind_of: Mapping[int, Kind], detection: DetectionConfig) -> Truth:
+def road_user_truth(
+    data: CocoData, kind_of: Mapping[int, Kind], detection: DetectionConfig
+) -> GroundTruth:
     """The data's road users as the deployed detector means them: riders joined to their cycles."""
-    rows = _Rows()
+    rows = _TruthBuilder()
     bare = {
         i
         for i, kind in kind_of.items()
@@ -77,8 +79,8 @@ def joined_truth(data: CocoData, kind_of: Mapping[int, Kind], detection: Detecti
     return rows.truth()
 
 
-class _Rows:
-    """Objects gathered for a `Truth`, boxes in pixels at the network's input."""
+class _TruthBuilder:
+    """Objects gathered for a `GroundTruth`, boxes in pixels at the network's input."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[int, int, bool, float]] = []
@@ -91,10 +93,10 @@ class _Rows:
         self._rows.append((number, group, thing.crowd, distance_m))
         self._boxes.append(np.multiply(thing.box_px, scale))
 
-    def truth(self) -> Truth:
+    def truth(self) -> GroundTruth:
         """All of them."""
         rows = self._rows
-        return Truth(
+        return GroundTruth(
             np.array([row[0] for row in rows], np.int64),
             np.array([row[1] for row in rows], np.int64),
             np.array(self._boxes, np.float64).reshape(-1, 4),

@@ -1,11 +1,10 @@
-"""Where a network takes something for somebody: windows to learn from more often.
+"""Hard-negative mining: crops around false positives.
 
-A street has thousands of places where nobody is and a few that look like somebody: a hydrant in the
-rain, a leaf before the lens. Windows cut at random hardly ever show those few. So, some way into
-the training, the network looks at the very pictures that it learns from, and its mistakes become
-windows of their own (Sung and Poggio 1998, "Example-based learning for view-based human face
-detection", section 2.5, who call it bootstrapping; Felzenszwalb et al. 2010, "Object detection with
-discriminatively trained part-based models", section 4.4: data-mining hard negatives).
+Most of a street is easy background; windows cut at random hardly ever show the few places that look
+like a road user, such as a hydrant in the rain. So the network is run over its training pictures
+between stages of the training, and its false positives become windows (Sung and Poggio 1998,
+"Example-based learning for view-based human face detection", section 2.5; Felzenszwalb et al. 2010,
+"Object detection with discriminatively trained part-based models", section 4.4).
 """
 
 from __future__ import annotations
@@ -23,53 +22,54 @@ import numpy as np
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.geometry.boxes import iou_matrix
-from bikeped.lab.training.coco import MISTAKEN, CocoData, CocoImage, furniture
+from bikeped.lab.training.coco import FALSE_POSITIVE, CocoData, CocoImage, furniture
 from bikeped.lab.training.crops import reduced_picture
 from bikeped.lab.training.export import export_network
 from bikeped.lab.training.network import SmallNet
-from bikeped.lab.training.quantise import quantise, shown_pictures
+from bikeped.lab.training.quantise import calibration_images, quantise
+from bikeped.lab.training.weights import SmallDetector
 from bikeped.types import Float32Array, FloatArray, Kind
 
-#: Shares of the steps: while it still learns fast, and again before it sees plain windows.
-AFTER = (0.4, 0.7)
-#: Mistakes of these kinds make a false alarm.
+#: Shares of the steps: while learning is fast, and again before the plain windows.
+MINING_ROUNDS = (0.4, 0.7)
+#: False positives of these kinds cause false alarms.
 _KINDS = (Kind.PEDESTRIAN, Kind.CYCLIST)
-_Look = tuple[CocoImage, Float32Array]  #: a picture and the boxes [n, 4] of everybody in it
+_LabelledImage = tuple[CocoImage, Float32Array]  #: and its objects [n, 4]
 
 
 @dataclass(frozen=True)
 class MiningSettings:
-    """When the network looks, and what counts."""
+    """When false positives are mined, and what counts as one."""
 
     after: tuple[float, ...] = ()  #: shares of the steps
-    confidence: float = 0.15  #: of a mistake, at least
-    overlap: float = 0.1  #: with anybody, below which it is one
+    confidence: float = 0.15  #: at least
+    overlap: float = 0.1  #: IoU with every object is below this
     processes: int = 2
 
 
-def with_mistakes(
+def mine_false_positives(
     network: SmallNet, data: CocoData, size: tuple[int, int], settings: MiningSettings
 ) -> tuple[CocoData, int]:
-    """`data` with what `network` (in evaluation, on the CPU) takes for pedestrians and cyclists
-    among the furniture of its pictures, as `MISTAKEN`, and how many they are; those that were there
-    before are gone.
+    """`data` with the false pedestrians and cyclists of `network` (in evaluation mode, on the CPU)
+    added to the furniture of its pictures as `FALSE_POSITIVE`, in place of earlier ones, and their
+    number.
 
-    It looks as it will on the street: in eight bits, at whole frames of `size` (width, height),
-    through the service's `load_detector`. Raises DataSetError and DetectorError.
+    The network runs as deployed: in eight bits, at whole frames of `size` (width, height), through
+    the service's `load_detector`. Raises DataSetError and DetectorError.
     """
     names = tuple(data.categories.values())
-    looks = [(i, _boxes(data, i)) for i in data.images]
+    labelled = [(i, _boxes(data, i)) for i in data.images]
     with tempfile.TemporaryDirectory(prefix="bikeped-mining-") as folder:
         whole, model = Path(folder) / "whole.onnx", Path(folder) / "model.onnx"
-        export_network(network, names, size, whole, {})
-        quantise(whole, shown_pictures(data, size), model)
+        export_network(SmallDetector(network, names, size), whole)
+        quantise(whole, calibration_images(data, size), model)
         with ProcessPoolExecutor(settings.processes, mp_context=get_context("spawn")) as pool:
             parts = [
-                pool.submit(_mistakes, model, looks[part :: settings.processes], settings)
+                pool.submit(_false_positives, model, labelled[part :: settings.processes], settings)
                 for part in range(settings.processes)
             ]
             found = {number: boxes for part in parts for number, boxes in part.result().items()}
-    images = tuple(_told(image, found[image.id]) for image in data.images)
+    images = tuple(_with_false_positives(image, found[image.id]) for image in data.images)
     return replace(data, images=images), sum(len(boxes) for boxes in found.values())
 
 
@@ -77,26 +77,26 @@ def _boxes(data: CocoData, image: CocoImage) -> Float32Array:
     return np.array([o.box_px for o in data.objects[image.id]], np.float32).reshape(-1, 4)
 
 
-def _mistakes(
-    model: Path, looks: Sequence[_Look], settings: MiningSettings
+def _false_positives(
+    model: Path, labelled: Sequence[_LabelledImage], settings: MiningSettings
 ) -> dict[int, FloatArray]:
-    """By picture, the boxes [n, 4] of what is nobody; runs in a process of its own."""
+    """False positives [n, 4] by picture id; runs in a process of its own."""
     cv2.setNumThreads(1)
     order = DetectionConfig(model=str(model), confidence=settings.confidence, threads=1)
     detector = load_detector(order, Path("/"))
     found = {}
-    for image, people in looks:
+    for image, objects in labelled:
         rgb = reduced_picture(image, *detector.decode_size(image.width, image.height))
         seen = detector.infer(rgb, image.width, image.height).detections
-        overlap = iou_matrix(seen.box_px, people).max(axis=1, initial=0.0)
+        overlap = iou_matrix(seen.box_px, objects).max(axis=1, initial=0.0)
         mistaken = (overlap < settings.overlap) & np.isin(seen.kind, _KINDS)
         found[image.id] = seen.box_px[mistaken].astype(np.float64)
     return found
 
 
-def _told(image: CocoImage, mistaken: FloatArray) -> CocoImage:
-    """`image` with these mistakes, and no others."""
-    things = [(what, box) for what, box in furniture(image) if what != MISTAKEN]
-    things += [(MISTAKEN, box) for box in mistaken.tolist()]
+def _with_false_positives(image: CocoImage, mistaken: FloatArray) -> CocoImage:
+    """`image` with these false positives, and no others."""
+    things = [(what, box) for what, box in furniture(image) if what != FALSE_POSITIVE]
+    things += [(FALSE_POSITIVE, box) for box in mistaken.tolist()]
     told = [{"what": w, "bbox": [u1, v1, u2 - u1, v2 - v1]} for w, (u1, v1, u2, v2) in things]
     return replace(image, entry={**image.entry, "furniture": told})

@@ -28,7 +28,7 @@ _TINY = 1e-9
 
 
 @dataclass(frozen=True)
-class Truth:
+class ImageLabels:
     """What is in one picture: `box_px` [m, 4], `class_id` [m] int64, `ignored_px` [k, 4].
 
     Cells in an ignored box (a crowd, somebody nearly hidden) are not told that nobody is there.
@@ -54,7 +54,7 @@ class Assignment:
 def detection_loss(
     score: torch.Tensor,
     edge: torch.Tensor,
-    truths: list[Truth],
+    truths: list[ImageLabels],
     centre: torch.Tensor,
     stride: torch.Tensor,
 ) -> tuple[torch.Tensor, dict[str, float]]:
@@ -79,7 +79,7 @@ def detection_loss(
         wanted[i, truth.class_id[mine], cells] = given.quality[cells]
         weight[i, :, cells] = 1.0
         found, true = box[i, cells], truth.box_px[mine]
-        overlaps.append(1 - generalised_overlap(found, true))
+        overlaps.append(1 - generalised_iou(found, true))
         size = (true[:, 2:] - true[:, :2]).prod(1).sqrt().clamp(min=4.0)
         distance = torch.nn.functional.smooth_l1_loss(
             found / size[:, None], true / size[:, None], reduction="none", beta=0.02
@@ -99,7 +99,7 @@ def detection_loss(
 
 
 def assign(
-    probability: torch.Tensor, box: torch.Tensor, truth: Truth, centre: torch.Tensor
+    probability: torch.Tensor, box: torch.Tensor, truth: ImageLabels, centre: torch.Tensor
 ) -> Assignment:
     """Which cells of one picture answer for which object (see the module's head).
 
@@ -107,7 +107,7 @@ def assign(
     cells that fit it best, a cell that several want answers for the one that it overlaps most.
     """
     near = _inside(centre, truth.box_px)
-    overlap = pair_overlap(truth.box_px, box) * near
+    overlap = pairwise_iou(truth.box_px, box) * near
     fit = probability[truth.class_id] ** _SCORE_POWER * overlap**_OVERLAP_POWER
     # Before it has learnt anything a network overlaps nothing: then the nearest cells answer.
     middle = (truth.box_px[:, None, :2] + truth.box_px[:, None, 2:]) / 2
@@ -127,7 +127,7 @@ def assign(
     return Assignment(chosen, takes.float().argmax(0), (fit * scale).sum(0) * chosen)
 
 
-def pair_overlap(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def pairwise_iou(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Intersection over union [n, m] of boxes [n, 4] and [m, 4]."""
     low = torch.maximum(a[:, None, :2], b[None, :, :2])
     high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
@@ -135,7 +135,7 @@ def pair_overlap(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return shared / (_area(a)[:, None] + _area(b)[None] - shared + _TINY)
 
 
-def generalised_overlap(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def generalised_iou(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Generalised intersection over union [n] of pairs of boxes, -1..1 (Rezatofighi, 2019)."""
     low, high = torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])
     shared = (high - low).clamp(min=0).prod(1)

@@ -19,7 +19,7 @@ from bikeped.errors import require
 from bikeped.lab.simulation.perception import SIZE_BOUNDS_PX2
 from bikeped.types import BoolArray, Float32Array, FloatArray, IntArray
 
-MOST_BOXES = 100  #: of one picture and class, as COCO has it
+MAX_DETECTIONS = 100  #: of one picture and class, as COCO has it
 #: Edges of the area bins of the recall curve, square pixels at the network's input.
 BIN_EDGES_PX2: tuple[float, ...] = tuple(
     float(side) ** 2 for side in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 512)
@@ -30,7 +30,7 @@ _HUGE = 1e10
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Objects of all pictures: `image` [n], `category` [n] from 0, `box_px` [n, 4], `crowd` [n].
 
     `distance_m` [n] is NaN where it is not known.
@@ -49,8 +49,8 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Detections of all pictures: as `Truth`, with `score` [n] in 0..1."""
+class DetectionSet:
+    """Detections of all pictures: as `GroundTruth`, with `score` [n] in 0..1."""
 
     image: IntArray
     category: IntArray
@@ -59,7 +59,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Row:
+class ClassMeasures:
     """The measures of one class; None where there is no object to measure by."""
 
     name: str
@@ -94,14 +94,14 @@ class Measures:
     the answers of each class that are no object and no crowd at IoU 0.50.
     """
 
-    rows: tuple[Row, ...]
-    overall: Row
+    rows: tuple[ClassMeasures, ...]
+    overall: ClassMeasures
     hits: BoolArray
     false: tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class Curve:
+class RecallCurve:
     """Recall against area: per bin the mean area of its objects, recall, and how many they are.
 
     `recall` is the mean over IoU 0.50 ... 0.95, `recall50` at 0.50.
@@ -122,7 +122,7 @@ class Curve:
         }
 
 
-def measure(truth: Truth, found: Found, names: Sequence[str], images: int) -> Measures:
+def measure(truth: GroundTruth, found: DetectionSet, names: Sequence[str], images: int) -> Measures:
     """COCO's measures of detections in pictures 0 ... `images` - 1.
 
     Boxes are in pixels at the network's input: their areas make small, medium and large (32 and 96
@@ -136,7 +136,7 @@ def measure(truth: Truth, found: Found, names: Sequence[str], images: int) -> Me
         own = (truth.category == index) & ~truth.crowd
         sizes = [int(np.count_nonzero(own & (bins == size))) for size in range(3)]
         rows.append(
-            Row(
+            ClassMeasures(
                 name,
                 int(np.count_nonzero(own)),
                 _mean(precision[:, :, index, 0, -1]),
@@ -151,8 +151,8 @@ def measure(truth: Truth, found: Found, names: Sequence[str], images: int) -> Me
 
 
 def recall_curve(
-    truth: Truth, hits: BoolArray, least_objects: int, category: int | None = None
-) -> Curve:
+    truth: GroundTruth, hits: BoolArray, least_objects: int, category: int | None = None
+) -> RecallCurve:
     """Recall over area bins, of all classes together or of one.
 
     A bin with fewer than `least_objects` objects joins the next larger one, the last one the one
@@ -172,7 +172,7 @@ def recall_curve(
             open_group = np.zeros(len(area), np.bool_)
     if open_group.any():
         groups = [*groups[:-1], groups[-1] | open_group] if groups else [open_group]
-    return Curve(
+    return RecallCurve(
         tuple(float(area[group].mean()) for group in groups),
         tuple(float(hit[group].mean()) for group in groups),
         tuple(float(hit[group, 0].mean()) for group in groups),
@@ -180,7 +180,7 @@ def recall_curve(
     )
 
 
-def recall_by_distance(truth: Truth, hits: BoolArray, category: int) -> list[dict[str, Any]]:
+def recall_by_distance(truth: GroundTruth, hits: BoolArray, category: int) -> list[dict[str, Any]]:
     """Of one class, for each bin of distance: how many objects, and how many found at IoU 0.50.
 
     Bins without objects are left out, and so are objects whose distance is not known.
@@ -204,7 +204,7 @@ def recall_by_distance(truth: Truth, hits: BoolArray, category: int) -> list[dic
     return rows
 
 
-def _evaluation(truth: Truth, found: Found, classes: int, images: int) -> Any:
+def _evaluation(truth: GroundTruth, found: DetectionSet, classes: int, images: int) -> Any:
     require("pycocotools")
     from pycocotools.cocoeval import COCOeval
 
@@ -239,7 +239,7 @@ def _evaluation(truth: Truth, found: Found, classes: int, images: int) -> Any:
         small, medium = SIZE_BOUNDS_PX2
         evaluation.params.areaRng = [[0, _HUGE], [0, small], [small, medium], [medium, _HUGE]]
         evaluation.params.areaRngLbl = ["all", "small", "medium", "large"]
-        evaluation.params.maxDets = [MOST_BOXES]
+        evaluation.params.maxDets = [MAX_DETECTIONS]
         evaluation.evaluate()
         evaluation.accumulate()
     return evaluation
@@ -274,12 +274,12 @@ def _hits(evaluation: Any, objects: int, classes: int) -> tuple[BoolArray, tuple
     return hits, tuple(false)
 
 
-def _overall(rows: Sequence[Row]) -> Row:
+def _overall(rows: Sequence[ClassMeasures]) -> ClassMeasures:
     def mean(values: list[float | None]) -> float | None:
         known = [value for value in values if value is not None]
         return float(np.mean(known)) if known else None
 
-    return Row(
+    return ClassMeasures(
         "all",
         sum(row.objects for row in rows),
         mean([row.ap for row in rows]),

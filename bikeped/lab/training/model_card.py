@@ -60,7 +60,7 @@ class DrawnTest:
 
 
 @dataclass(frozen=True)
-class Sight:
+class DetectionRecord:
     """One object of one picture, or one detection that is nobody (`distance_m` NaN)."""
 
     kind: Kind
@@ -84,19 +84,22 @@ class Sight:
         return self.found and self.confidence >= confidence
 
 
+Records = Sequence[Sequence[DetectionRecord]]  #: by picture
+
+
 def drawn_test(
     models: Sequence[DetectionConfig],
     loaded: LoadedConfig,
     test: DrawnTest,
     progress: Callable[[int], None] = lambda done: None,
-) -> tuple[list[list[list[Sight]]], list[str]]:
+) -> tuple[list[list[list[DetectionRecord]]], list[str]]:
     """For each model what it made of every picture, and every picture's light and weather.
 
     `model.model` is an absolute path.
     """
     detectors: dict[Region, list[Detector]] = {}
     range_m = loaded.config.decision.max_range_m
-    seen: list[list[list[Sight]]] = [[] for _ in models]
+    seen: list[list[list[DetectionRecord]]] = [[] for _ in models]
     lights = []
     for jpeg, objects, view, conditions in _drawn(loaded, test):
         # Each camera's road, as the service has it of its own camera.
@@ -104,14 +107,14 @@ def drawn_test(
         if region not in detectors:
             detectors[region] = [load_detector(model, Path("/"), region) for model in models]
         for detector, rows in zip(detectors[region], seen, strict=True):
-            rows.append(judge_picture(_look(detector, jpeg, view), objects, view))
+            rows.append(match_detections(_detect(detector, jpeg, view), objects, view))
         lights.append("rain" if conditions.weather == "rain" else conditions.light)
         progress(len(lights))
     return seen, lights
 
 
-def by_light(
-    seen: Sequence[Sequence[Sight]], lights: Sequence[str], confidence: float
+def summary_by_light(
+    seen: Records, lights: Sequence[str], confidence: float
 ) -> dict[str, dict[str, Any]]:
     """For every light (rain by itself): frames, recall within 15 m by kind, false a 100 frames."""
     rows: dict[str, dict[str, Any]] = {}
@@ -130,7 +133,7 @@ def by_light(
     return rows
 
 
-def summary(seen: Sequence[Sequence[Sight]], confidence: float) -> dict[str, Any]:
+def summary(seen: Records, confidence: float) -> dict[str, Any]:
     """The numbers at one confidence: recall and error by kind and ring, false ones a 100 frames."""
     rows = [s for picture in seen for s in picture]
     result: dict[str, Any] = {"frames": len(seen), "confidence": confidence, "kinds": {}}
@@ -147,7 +150,10 @@ def summary(seen: Sequence[Sequence[Sight]], confidence: float) -> dict[str, Any
                 [s for s in mine if s.visible >= MOSTLY_VISIBLE], 0, NEAR_M, confidence
             ),
             "rings": rings,
-            **{f"{what}_per_100_frames": _a_hundred(extra.count(what), seen) for what in _EXTRA},
+            **{
+                f"{what}_per_100_frames": _per_100_frames(extra.count(what), seen)
+                for what in _EXTRA
+            },
         }
     for what in _EXTRA:
         result[f"{what}_pedestrian_or_cyclist_per_100_frames"] = round(
@@ -160,11 +166,11 @@ def summary(seen: Sequence[Sequence[Sight]], confidence: float) -> dict[str, Any
     return result
 
 
-def _a_hundred(count: int, seen: Sequence[Sequence[Sight]]) -> float:
+def _per_100_frames(count: int, seen: Records) -> float:
     return round(100 * count / max(1, len(seen)), 3)
 
 
-def sweep(seen: Sequence[Sequence[Sight]], confidences: Sequence[float]) -> list[dict[str, float]]:
+def sweep(seen: Records, confidences: Sequence[float]) -> list[dict[str, float]]:
     """Recall within 15 m and false ones a 100 frames over confidences: how to choose one."""
     rows = []
     for confidence in confidences:
@@ -188,9 +194,7 @@ def sweep(seen: Sequence[Sequence[Sight]], confidences: Sequence[float]) -> list
     return rows
 
 
-def choose_confidence(
-    seen: Sequence[Sequence[Sight]], kind: Kind, grid: Sequence[float], most_false: float
-) -> float:
+def choose_confidence(seen: Records, kind: Kind, grid: Sequence[float], most_false: float) -> float:
     """The lowest confidence of `grid` with at most `most_false` false ones of `kind` a 100 frames;
     the highest of `grid` where there is none."""
     for confidence in sorted(grid):
@@ -200,7 +204,9 @@ def choose_confidence(
     return float(max(grid))
 
 
-def _numbers(mine: list[Sight], low: float, high: float, confidence: float) -> dict[str, Any]:
+def _numbers(
+    mine: list[DetectionRecord], low: float, high: float, confidence: float
+) -> dict[str, Any]:
     inside = [s for s in mine if low <= s.distance_m < high]
     hits = [s for s in inside if s.found_at(confidence)]
     errors = np.array([s.error_m for s in hits if np.isfinite(s.error_m)])
@@ -235,15 +241,15 @@ def _part(loaded: LoadedConfig, test: DrawnTest, number: int, count: int) -> lis
     ]
 
 
-def _look(detector: Detector, jpeg: bytes, view: SceneCamera) -> Detections:
+def _detect(detector: Detector, jpeg: bytes, view: SceneCamera) -> Detections:
     width, height = view.size
     rgb = JpegDecoder(1).decode(jpeg, *detector.decode_size(width, height))
     return detector.infer(rgb, width, height).detections
 
 
-def judge_picture(
+def match_detections(
     found: Detections, objects: Sequence[DrawnObject], view: SceneCamera
-) -> list[Sight]:
+) -> list[DetectionRecord]:
     """Greedy by confidence, kind for kind, at an overlap of at least `MATCH_IOU`.
 
     A detection on somebody who is hardly visible, tiny or very far, of whatever kind, is neither
@@ -278,7 +284,7 @@ def judge_picture(
             other = bool(((overlap[d] >= MATCH_IOU) & ~mine & asked).any())
             score, label = float(found.confidence[d]), Kind(int(found.kind[d]))
             loose = LOOSE_IOU <= most < MATCH_IOU
-            rows.append(Sight(label, np.nan, False, score, np.nan, other, loose))
+            rows.append(DetectionRecord(label, np.nan, False, score, np.nan, other, loose))
     ground, valid = _ground(found, view)
     for o in np.nonzero(asked)[0].tolist():
         item, d = objects[o], taken.get(o, -1)
@@ -287,7 +293,9 @@ def judge_picture(
             error = float(np.hypot(*(ground[d] - item.xy_m)))
         confidence = float(found.confidence[d]) if d >= 0 else 0.0
         rows.append(
-            Sight(item.label, item.distance_m, d >= 0, confidence, error, visible=item.visible)
+            DetectionRecord(
+                item.label, item.distance_m, d >= 0, confidence, error, visible=item.visible
+            )
         )
     return rows
 

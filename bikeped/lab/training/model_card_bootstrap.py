@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.lab.rendering.dataset import PICTURES_A_STREET
-from bikeped.lab.training.model_card import NEAR_M, Sight
+from bikeped.lab.training.model_card import NEAR_M, DetectionRecord, Records
 from bikeped.types import FloatArray, Kind
 
 _KINDS = (Kind.PEDESTRIAN, Kind.CYCLIST)
@@ -16,8 +16,8 @@ _DRAWS = 2000
 _LOW, _HIGH = 2.5, 97.5  #: percentiles
 
 
-def spread(
-    seen: Sequence[Sequence[Sight]], confidence: float, a_street: int = PICTURES_A_STREET
+def bootstrap_spread(
+    seen: Records, confidence: float, a_street: int = PICTURES_A_STREET
 ) -> dict[str, Any]:
     """Where the recalls within 15 m of pedestrians and cyclists and the false ones of both a 100
     frames lie, lowest and highest, in 95 of 100 tests of as many streets.
@@ -42,7 +42,7 @@ def spread(
     return result
 
 
-def _counts(picture: Sequence[Sight], confidence: float) -> list[int]:
+def _counts(picture: Sequence[DetectionRecord], confidence: float) -> list[int]:
     """Found and asked for of each kind, false ones, and one frame."""
     row = []
     for kind in _KINDS:

@@ -7,8 +7,8 @@ from typing import Any
 
 from bikeped.types import Kind
 
-AIM_RECALL, AIM_FALSE = 0.95, 1.0
-_LITTLE_AP = 0.2  #: of all road users: less is no trained network
+TARGET_RECALL, TARGET_FALSE = 0.95, 1.0
+_UNTRAINED_AP = 0.2  #: of all road users: less is no trained network
 _WALKS_AND_RIDES = (Kind.PEDESTRIAN, Kind.CYCLIST)
 _FALSE = "false_pedestrian_or_cyclist_per_100_frames"
 
@@ -74,7 +74,7 @@ object's true middle: the near face of what has a depth is always nearer than it
 _ROUND = "| {ring} | {objects} | {recall} | {median} | {p90} |"
 
 
-def card_text(card: Mapping[str, Any]) -> str:
+def render_card(card: Mapping[str, Any]) -> str:
     """Markdown; `card` is what `scripts/train-detector` writes as JSON beside it."""
     model, made = card["model"], card["made"]
     training, test = made["training"], card["configured_camera"]
@@ -101,7 +101,7 @@ def card_text(card: Mapping[str, Any]) -> str:
         training_min=training["seconds"] / 60,
         steps=settings["steps"],
         windows=settings["pictures"] * settings["windows"],
-        mistakes=_mistakes(training),
+        mistakes=_false_positives(training),
         packed=settings["packed"],
         squares=settings["pack"]["squares"],
         side=settings["pack"]["side"],
@@ -132,7 +132,7 @@ def card_text(card: Mapping[str, Any]) -> str:
     return text
 
 
-def _mistakes(training: Mapping[str, Any]) -> str:
+def _false_positives(training: Mapping[str, Any]) -> str:
     """When it looked at its own pictures, and what came of it."""
     settings, counts = training["settings"], training["mistakes"]
     if not counts:
@@ -165,15 +165,15 @@ def _mix(mine: Mapping[str, float], usual: Mapping[str, float]) -> str:
     return f"{', '.join(parts)}, and {things}"
 
 
-def reached(test: Mapping[str, Any]) -> bool:
+def meets_target(test: Mapping[str, Any]) -> bool:
     """Whether a test of the card has what was aimed at."""
-    return bool(min(_recalls(test).values()) >= AIM_RECALL and test[_FALSE] <= AIM_FALSE)
+    return bool(min(_recalls(test).values()) >= TARGET_RECALL and test[_FALSE] <= TARGET_FALSE)
 
 
 def _verdict(test: Mapping[str, Any]) -> str:
-    aim = f"Aimed at, through the configured camera: recall of at least {AIM_RECALL:.0%} within "
-    aim += f"15 m for pedestrians and cyclists, at most {AIM_FALSE:g} false one a 100 frames."
-    if reached(test):
+    aim = f"Aimed at, through the configured camera: recall of at least {TARGET_RECALL:.0%} within "
+    aim += f"15 m for pedestrians and cyclists, at most {TARGET_FALSE:g} false one a 100 frames."
+    if meets_target(test):
         return f"{aim} **Reached.**"
     recalls = " and ".join(f"{recall:.1%}" for recall in _recalls(test).values())
     return f"{aim} **It falls short:** {recalls}, with {test[_FALSE]:.1f} false ones."
@@ -295,7 +295,7 @@ def _experiment(experiment: Mapping[str, Any]) -> str:
         "The box of a warped object is that of its old box's warped outline, a little wider than",
         "the exact ones that are asked for: AP@50:95 counts that, AP@50 hardly does.",
     ]
-    if max(row["ap"] or 0.0 for row in rows[0][1:]) < _LITTLE_AP:
+    if max(row["ap"] or 0.0 for row in rows[0][1:]) < _UNTRAINED_AP:
         lines += [
             "",
             "Neither has learnt much in so few steps: this says little about a longer training.",

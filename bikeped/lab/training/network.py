@@ -114,7 +114,7 @@ class SmallNet(nn.Module):
         return torch.cat([a[0] for a in answers], 2), torch.cat([a[1] for a in answers], 2)
 
 
-class Exported(nn.Module):
+class ExportModule(nn.Module):
     """The network with its answer in the layout `yolov8`: [n, 4 + classes, cells].
 
     Rows: centre u, centre v, width, height in pixels of the input, then a score in 0..1 a class.

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.lab.training.coco import MISTAKEN
-from bikeped.lab.training.crops import Crop, CropSettings, Cutter, View
+from bikeped.lab.training.coco import FALSE_POSITIVE
+from bikeped.lab.training.crops import Crop, Cropper, CropSettings, Sample
 from bikeped.types import BoolArray, FloatArray
 
 BLOCK_PX = 64
@@ -45,17 +45,17 @@ class PackSettings:
 
 
 @dataclass(frozen=True)
-class _Pick:
-    """A box of `view` (empty: none) at a scale; its window is `blocks` blocks wide."""
+class _Window:
+    """A box of `sample` (empty: none) at a scale; its window is `blocks` blocks wide."""
 
-    view: View
+    sample: Sample
     box_px: FloatArray
     scale: float
     blocks: int
 
 
 @dataclass(frozen=True)
-class _Lots:
+class SamplingPool:
     """What a window may be about, each as number of its picture in the pool and number there:
     objects by class, things by kind, and what a network took for somebody."""
 
@@ -64,29 +64,31 @@ class _Lots:
     mistakes: list[tuple[int, int]]
 
     @classmethod
-    def of(cls, pool: Sequence[View]) -> _Lots:
+    def of(cls, pool: Sequence[Sample]) -> SamplingPool:
         things = _by_thing(pool)
-        mistakes = things.pop(MISTAKEN, [])
+        mistakes = things.pop(FALSE_POSITIVE, [])
         return cls(_by_class(pool), things, mistakes)
 
 
 class Packer:
     """Fills squares from a pool of pictures."""
 
-    def __init__(self, settings: PackSettings, crops: CropSettings, cutter: Cutter) -> None:
-        self._settings, self._scale, self._cutter = settings, crops.scale, cutter
+    def __init__(self, settings: PackSettings, crops: CropSettings, cropper: Cropper) -> None:
+        self._settings, self._scale, self._cropper = settings, crops.scale, cropper
 
-    def __call__(self, pool: Sequence[View], count: int, random: np.random.Generator) -> list[Crop]:
+    def __call__(
+        self, pool: Sequence[Sample], count: int, random: np.random.Generator
+    ) -> list[Crop]:
         """`count` squares, from pictures of `pool`."""
         side = self._settings.side // BLOCK_PX
         free = np.ones((count, side, side), np.bool_)
         placed: list[list[tuple[int, int, Crop]]] = [[] for _ in range(count)]
-        lots = _Lots.of(pool)
+        lots = SamplingPool.of(pool)
         misses = 0
         while free.any():
-            pick = self._pick(pool, lots, random) if misses < _TRIES else None
+            pick = self._choose_window(pool, lots, random) if misses < _TRIES else None
             if pick is None:
-                pick = _Pick(pool[int(random.integers(len(pool)))], np.zeros(0), 1.0, 1)
+                pick = _Window(pool[int(random.integers(len(pool)))], np.zeros(0), 1.0, 1)
             spot = first_fit(free, pick.blocks)
             if spot is None:
                 misses += 1
@@ -95,19 +97,21 @@ class Packer:
             square, row, column = spot
             free[square, row : row + pick.blocks, column : column + pick.blocks] = False
             placed[square].append((row, column, self._cut(pick, random)))
-        return [_joined(tiles, self._settings.side) for tiles in placed]
+        return [_assembled(tiles, self._settings.side) for tiles in placed]
 
-    def _pick(self, pool: Sequence[View], lots: _Lots, random: np.random.Generator) -> _Pick | None:
+    def _choose_window(
+        self, pool: Sequence[Sample], lots: SamplingPool, random: np.random.Generator
+    ) -> _Window | None:
         """First the class, then one of its objects; None for a window with nobody in its middle."""
         settings = self._settings
         if lots.mistakes and random.random() < settings.mistaken:
             number, index = lots.mistakes[int(random.integers(len(lots.mistakes)))]
-            return self._around(pool[number], pool[number].mistaken_px[index], random)
+            return self._object_window(pool[number], pool[number].false_positive_px[index], random)
         what = random.random() - settings.empty
         if what < 0:
             return None
         if what < settings.furniture and lots.things:
-            return self._thing(pool, lots.things, random)
+            return self._furniture_window(pool, lots.things, random)
         by_class = lots.by_class
         if not any(by_class):
             return None
@@ -119,25 +123,27 @@ class Packer:
         if kind >= len(by_class) or not by_class[kind]:
             kind = int(random.choice([k for k, found in enumerate(by_class) if found]))
         number, index = by_class[kind][int(random.integers(len(by_class[kind])))]
-        pick = self._around(pool[number], pool[number].box_px[index], random)
+        pick = self._object_window(pool[number], pool[number].box_px[index], random)
         likely = settings.taken[min(pick.blocks, len(settings.taken)) - 1]
         if random.random() >= likely:
-            return self._pick(pool, lots, random)
+            return self._choose_window(pool, lots, random)
         return pick
 
-    def _around(self, view: View, box: FloatArray, random: np.random.Generator) -> _Pick:
+    def _object_window(
+        self, sample: Sample, box: FloatArray, random: np.random.Generator
+    ) -> _Window:
         """A window that holds `box` [4] and a little of what surrounds it."""
         scale = float(random.uniform(*self._scale))
         longest = float((box[2:] - box[:2]).max()) * scale * self._settings.room
         blocks = int(np.clip(np.ceil(longest / BLOCK_PX), 1, self._settings.side // BLOCK_PX))
-        return _Pick(view, box, scale, blocks)
+        return _Window(sample, box, scale, blocks)
 
-    def _thing(
+    def _furniture_window(
         self,
-        pool: Sequence[View],
+        pool: Sequence[Sample],
         things: dict[str, list[tuple[int, int]]],
         random: np.random.Generator,
-    ) -> _Pick:
+    ) -> _Window:
         """A window about any spot of a thing: first the kind of thing, then one of them."""
         kinds = sorted(things)
         kind = kinds[int(random.integers(len(kinds)))]
@@ -146,12 +152,12 @@ class Packer:
         spot = box[:2] + random.uniform(0, 1, 2) * (box[2:] - box[:2])
         blocks = 1 if random.random() < _NARROW else min(2, self._settings.side // BLOCK_PX)
         scale = float(random.uniform(*self._scale))
-        return _Pick(pool[number], np.concatenate([spot, spot]), scale, blocks)
+        return _Window(pool[number], np.concatenate([spot, spot]), scale, blocks)
 
-    def _cut(self, pick: _Pick, random: np.random.Generator) -> Crop:
+    def _cut(self, pick: _Window, random: np.random.Generator) -> Crop:
         side = pick.blocks * BLOCK_PX
-        return self._cutter(
-            pick.view, random, window=(side, side), around=pick.box_px, scale=pick.scale
+        return self._cropper(
+            pick.sample, random, window=(side, side), around=pick.box_px, scale=pick.scale
         )
 
 
@@ -169,27 +175,27 @@ def first_fit(free: BoolArray, blocks: int) -> tuple[int, int, int] | None:
     return int(square), int(row), int(column)
 
 
-def _by_class(pool: Sequence[View]) -> list[list[tuple[int, int]]]:
+def _by_class(pool: Sequence[Sample]) -> list[list[tuple[int, int]]]:
     """For every class: picture of the pool and number there of each of its objects."""
     most = max((int(v.class_id.max()) for v in pool if len(v.class_id)), default=-1)
     found: list[list[tuple[int, int]]] = [[] for _ in range(most + 1)]
-    for number, view in enumerate(pool):
-        for index in np.flatnonzero(view.crowd == 0).tolist():
-            lots = [(number, index)] * view.turns(index)
-            found[int(view.class_id[index])].extend(lots)
+    for number, sample in enumerate(pool):
+        for index in np.flatnonzero(sample.crowd == 0).tolist():
+            lots = [(number, index)] * sample.sampling_weight(index)
+            found[int(sample.class_id[index])].extend(lots)
     return found
 
 
-def _by_thing(pool: Sequence[View]) -> dict[str, list[tuple[int, int]]]:
+def _by_thing(pool: Sequence[Sample]) -> dict[str, list[tuple[int, int]]]:
     """For every kind of thing: picture of the pool and number there of each of them."""
     found: dict[str, list[tuple[int, int]]] = {}
-    for number, view in enumerate(pool):
-        for what, boxes in view.furniture_px.items():
+    for number, sample in enumerate(pool):
+        for what, boxes in sample.furniture_px.items():
             found.setdefault(what, []).extend((number, index) for index in range(len(boxes)))
     return found
 
 
-def _joined(tiles: list[tuple[int, int, Crop]], side: int) -> Crop:
+def _assembled(tiles: list[tuple[int, int, Crop]], side: int) -> Crop:
     """One square of its windows."""
     rgb = np.zeros((side, side, 3), np.uint8)
     boxes: list[FloatArray] = [np.zeros((0, 4))]

@@ -25,7 +25,7 @@ from bikeped.files import write_whole
 from bikeped.lab.training.coco import CocoData, read_picture
 from bikeped.types import Float32Array
 
-PICTURES = 64  #: are enough to take the steps from
+CALIBRATION_IMAGES = 64  #: are enough to take the steps from
 _INPUT = "images"
 #: How the names of the operations begin that are rounded, as `export` writes them. Not the joining
 #: of the answers: edges would be rounded to a twentieth of a cell.
@@ -35,8 +35,8 @@ _ROUNDED = re.compile(
 _OPERATIONS = ["Conv", "Relu", "Concat", "Add", "Slice", "Resize"]
 
 
-def shown_pictures(
-    data: CocoData, size: tuple[int, int], count: int = PICTURES
+def calibration_images(
+    data: CocoData, size: tuple[int, int], count: int = CALIBRATION_IMAGES
 ) -> Iterator[Float32Array]:
     """About `count` pictures of `data`, evenly spread, as a network of input `size` (width, height)
     is shown them: [1, 3, h, w], 0..1. Raises DataSetError for one that cannot be read."""
@@ -50,7 +50,7 @@ def shown_pictures(
 def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
     """Writes `model`, an ONNX file of the small network, in eight bits to `out`; returns its bytes.
 
-    `pictures` as `shown_pictures` has them: the mean of what each of them needs is within the
+    `pictures` as `calibration_images` has them: the mean of what each of them needs is within the
     steps, what is beyond is cut off. Weights take seven of the eight bits, for with eight the sums
     of two products overflow on processors with AVX2 only (ONNX Runtime, "Quantize ONNX models",
     `reduce_range`). Raises DetectorError where there is no picture, or the model is none of ours.

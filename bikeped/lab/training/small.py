@@ -11,15 +11,15 @@ import torch
 
 from bikeped.lab.training.coco import CocoData
 from bikeped.lab.training.crops import CropSettings
-from bikeped.lab.training.device import knows_bfloat16, named_device
+from bikeped.lab.training.device import resolve_device, supports_bfloat16
 from bikeped.lab.training.export import export_network
 from bikeped.lab.training.fit import FitSettings, fit, settings_as_dict
 from bikeped.lab.training.hard_negative_mining import MiningSettings
-from bikeped.lab.training.weights import save_weights
+from bikeped.lab.training.weights import SmallDetector, save_weights
 
 
 @dataclass(frozen=True)
-class SmallOrder:
+class SmallTrainSettings:
     """What is asked for; the rest is `FitSettings`' own."""
 
     steps: int = 6000
@@ -34,7 +34,7 @@ class SmallOrder:
 def train_small(
     data: CocoData,
     out: Path,
-    order: SmallOrder,
+    order: SmallTrainSettings,
     progress: Callable[[int], None] = lambda done: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def train_small(
 
     Raises DataSetError and DetectorError.
     """
-    device = named_device(order.device)
+    device = resolve_device(order.device)
     on_cpu = device == "cpu"
     settings = FitSettings(
         steps=order.steps,
@@ -50,7 +50,7 @@ def train_small(
         warmup=min(100, max(1, order.steps // 10)),
         workers=2 if on_cpu and order.pictures % 2 == 0 else 1,
         seed=order.seed,
-        bfloat16=knows_bfloat16(device),
+        bfloat16=supports_bfloat16(device),
         device=device,
         crops=order.crops,
         mining=order.mining,
@@ -58,8 +58,9 @@ def train_small(
     fitted = fit(data, settings, progress, say)
     facts = order.facts | {"data_sha256": data.sha256, "steps": order.steps, "seed": order.seed}
     weights, model = out / "weights.pt", out / "model.onnx"
-    save_weights(fitted.network, fitted.names, fitted.size, weights, facts)
-    exported = export_network(fitted.network, fitted.names, fitted.size, model, facts)
+    detector = SmallDetector(fitted.network, fitted.names, fitted.size, facts)
+    save_weights(detector, weights)
+    exported = export_network(detector, model)
     return {
         "network": "small",
         "data": str(data.source),

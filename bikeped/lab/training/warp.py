@@ -206,9 +206,9 @@ def warp_picture(image: ImageArray, warp: Warp) -> ImageArray:
     xy, inside = warp.inverse(window, (wide, high))
     if not inside.any():
         return out
-    level = _level(xy, inside)
+    level = _pyramid_level(xy, inside)
     part = out[top:low, left:right]
-    part[inside] = _mixed(image, xy.astype(np.float32), level, inside)[inside]
+    part[inside] = _sample_pyramid(image, xy.astype(np.float32), level, inside)[inside]
     return out
 
 
@@ -224,7 +224,7 @@ def _picture_window(warp: Warp, picture_wh: Size) -> tuple[int, int, int, int]:
     return left, top, right, low
 
 
-def _level(xy: FloatArray, inside: BoolArray) -> Float32Array:
+def _pyramid_level(xy: FloatArray, inside: BoolArray) -> Float32Array:
     """[h, w] log2 of the local shrinking, 0 where the lens enlarges."""
     if min(xy.shape[:2]) < 2:
         return np.zeros(xy.shape[:2], np.float32)
@@ -237,7 +237,7 @@ def _level(xy: FloatArray, inside: BoolArray) -> Float32Array:
     return np.where(inside & np.isfinite(level), level, 0.0).astype(np.float32)
 
 
-def _mixed(
+def _sample_pyramid(
     image: ImageArray, xy: Float32Array, level: Float32Array, inside: BoolArray
 ) -> ImageArray:
     """The picture read at `xy`, each pixel from the two copies around its level."""
@@ -287,14 +287,14 @@ def warp_boxes(
             share[index] = 1.0
         else:
             if border is None:
-                border = _border(warp, picture_wh)
+                border = _visible_border(warp, picture_wh)
             edge_uv, edge_xy = border
             ends = [
-                _where_it_leaves(warp, picture_wh, curve, seen)
+                _exit_points(warp, picture_wh, curve, seen)
                 for curve, (_, seen) in zip(curves, mapped, strict=True)
             ]
-            points = np.concatenate([points, *ends, edge_uv[_within(edge_xy, box, rings)]])
-            share[index] = _share_left(warp, picture_wh, box, rings)
+            points = np.concatenate([points, *ends, edge_uv[_in_object(edge_xy, box, rings)]])
+            share[index] = _visible_share(warp, picture_wh, box, rings)
         if len(points):
             result[index, :2], result[index, 2:] = points.min(axis=0), points.max(axis=0)
     return result, share
@@ -321,9 +321,7 @@ def _outline(ring: FloatArray) -> FloatArray:
     return np.asarray(start + step * along[:, None])
 
 
-def _where_it_leaves(
-    warp: Warp, picture_wh: Size, curve: FloatArray, seen: BoolArray
-) -> FloatArray:
+def _exit_points(warp: Warp, picture_wh: Size, curve: FloatArray, seen: BoolArray) -> FloatArray:
     """[k, 2] the last points seen of a closed curve where it leaves what the lens shows."""
     after = np.roll(seen, -1)
     leaves = np.nonzero(seen != after)[0]
@@ -337,7 +335,7 @@ def _where_it_leaves(
     return warp.forward(inner, picture_wh)[0]
 
 
-def _border(warp: Warp, picture_wh: Size) -> tuple[FloatArray, FloatArray]:
+def _visible_border(warp: Warp, picture_wh: Size) -> tuple[FloatArray, FloatArray]:
     """Points along the rim of what is seen that show the picture: in the square, in the picture."""
     size = float(warp.size_px)
     turn = np.linspace(0, 2 * math.pi, RIM_SAMPLES, endpoint=False)
@@ -353,7 +351,7 @@ def _border(warp: Warp, picture_wh: Size) -> tuple[FloatArray, FloatArray]:
     return uv[inside], xy[inside]
 
 
-def _within(xy: FloatArray, box: FloatArray, rings: Sequence[FloatArray]) -> BoolArray:
+def _in_object(xy: FloatArray, box: FloatArray, rings: Sequence[FloatArray]) -> BoolArray:
     """Which points [n, 2] of the picture belong to the object."""
     inside: BoolArray = np.asarray(
         (xy[:, 0] >= box[0]) & (xy[:, 1] >= box[1]) & (xy[:, 0] <= box[2]) & (xy[:, 1] <= box[3])
@@ -361,11 +359,11 @@ def _within(xy: FloatArray, box: FloatArray, rings: Sequence[FloatArray]) -> Boo
     if len(rings) == 0 or not inside.any():
         return inside
     few = np.nonzero(inside)[0]
-    inside[few] = np.any([_in_ring(xy[few], ring) for ring in rings], axis=0)
+    inside[few] = np.any([_in_polygon(xy[few], ring) for ring in rings], axis=0)
     return inside
 
 
-def _in_ring(xy: FloatArray, ring: FloatArray) -> BoolArray:
+def _in_polygon(xy: FloatArray, ring: FloatArray) -> BoolArray:
     """Which points lie inside a closed outline (a ray to the right crosses it an odd number of
     times)."""
     x, y = xy[:, 0, None], xy[:, 1, None]
@@ -377,14 +375,14 @@ def _in_ring(xy: FloatArray, ring: FloatArray) -> BoolArray:
     return np.asarray((spans & (x < crossing)).sum(axis=1) % 2 == 1)
 
 
-def _share_left(
+def _visible_share(
     warp: Warp, picture_wh: Size, box: FloatArray, rings: Sequence[FloatArray]
 ) -> float:
     """Share of the object's area in the picture that is still seen, on a grid of points."""
     step = (np.arange(_SHARE_GRID) + 0.5) / _SHARE_GRID
     x, y = box[0] + (box[2] - box[0]) * step, box[1] + (box[3] - box[1]) * step
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    own = grid[_within(grid, box, rings)]
+    own = grid[_in_object(grid, box, rings)]
     if len(own) == 0:  # thinner than the grid
         own = grid
     return float(warp.forward(own, picture_wh)[1].mean())

@@ -1,8 +1,9 @@
-"""Files of the small network's weights: written whole, read without running what they hold."""
+"""Weight files of the small network; reading one executes nothing in it."""
 
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +16,26 @@ from bikeped.lab.training.network import SmallNet
 FORMAT = "bikeped small detector 2"
 
 
-def save_weights(
-    network: SmallNet,
-    names: tuple[str, ...],
-    size: tuple[int, int],
-    path: Path,
-    facts: dict[str, Any],
-) -> None:
-    """Writes the network with its names, input size (width, height) and `facts` (plain values),
-    whole or not."""
+@dataclass(frozen=True)
+class SmallDetector:
+    """The small network with what its files record: class names, input size (width, height) and
+    facts about its training (plain values)."""
+
+    network: SmallNet
+    names: tuple[str, ...]
+    size: tuple[int, int]
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def save_weights(detector: SmallDetector, path: Path) -> None:
+    """Writes a weight file, whole or not at all."""
     file = io.BytesIO()
     body = {
         "format": FORMAT,
-        "names": list(names),
-        "size": list(size),
-        "facts": facts,
-        "weights": network.state_dict(),
+        "names": list(detector.names),
+        "size": list(detector.size),
+        "facts": detector.facts,
+        "weights": detector.network.state_dict(),
     }
     torch.save(body, file)
     write_whole(path, file.getvalue())
@@ -41,11 +46,8 @@ def is_small(path: Path) -> bool:
     return _read(path).get("format") == FORMAT
 
 
-def load_weights(path: Path) -> tuple[SmallNet, tuple[str, ...], tuple[int, int], dict[str, Any]]:
-    """Network, names, input size (width, height) and facts; DetectorError where it is no such file.
-
-    Nothing in the file is executed.
-    """
+def load_weights(path: Path) -> SmallDetector:
+    """Reads a weight file, the network in evaluation mode; DetectorError where it is none."""
     body = _read(path)
     if body.get("format") != FORMAT:
         raise DetectorError(
@@ -57,7 +59,7 @@ def load_weights(path: Path) -> tuple[SmallNet, tuple[str, ...], tuple[int, int]
         width, height = (int(side) for side in body["size"])
         network = SmallNet(len(names))
         network.load_state_dict(body["weights"])
-        return network.eval(), names, (width, height), dict(body["facts"])
+        return SmallDetector(network.eval(), names, (width, height), dict(body["facts"]))
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DetectorError(f"{path}: its weights do not fit ({_line(error)})") from error
 

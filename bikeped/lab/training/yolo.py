@@ -29,7 +29,7 @@ _OPSET = 17
 
 
 @dataclass(frozen=True)
-class YoloOrder:
+class YoloTrainSettings:
     """What is asked of the library."""
 
     network: str = "yolov9-s"  #: yolov9-t, -s, -m, -c
@@ -43,7 +43,7 @@ class YoloOrder:
 
 
 def train_yolo(
-    data: CocoData, validation: CocoData | None, out: Path, order: YoloOrder
+    data: CocoData, validation: CocoData | None, out: Path, order: YoloTrainSettings
 ) -> dict[str, Any]:
     """Trains and exports; writes `out`/weights.pt and `out`/model.onnx, returns what was done.
 

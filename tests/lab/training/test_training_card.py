@@ -11,16 +11,16 @@ from bikeped.config import load_config
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.lab.rendering import DrawnObject, scene_camera
 from bikeped.lab.training.model_card import (
+    DetectionRecord,
     DrawnTest,
-    Sight,
-    by_light,
     choose_confidence,
     drawn_test,
-    judge_picture,
+    match_detections,
     summary,
+    summary_by_light,
     sweep,
 )
-from bikeped.lab.training.model_card_bootstrap import spread
+from bikeped.lab.training.model_card_bootstrap import bootstrap_spread
 from bikeped.models import BUNDLED_FILE
 from bikeped.types import Detections, Kind
 
@@ -54,7 +54,7 @@ def test_somebody_found_and_how_far_off_on_the_ground(view):
     assert valid.all()
     u, v = view.framing.crop_to_frame(uv)[0]
     box = (u - 10, v - 40, u + 10, v)
-    (sight,) = judge_picture(found((PED, 0.7, box)), [thing(box, xy=(8.0, 1.0))], view)
+    (sight,) = match_detections(found((PED, 0.7, box)), [thing(box, xy=(8.0, 1.0))], view)
     assert sight.found
     assert sight.error_m == pytest.approx(0, abs=1e-3)
     assert sight.confidence == pytest.approx(0.7)
@@ -62,49 +62,49 @@ def test_somebody_found_and_how_far_off_on_the_ground(view):
 
 
 def test_misses_wrong_kinds_and_doubles(view):
-    (miss,) = judge_picture(found(), [thing(BOX)], view)
+    (miss,) = match_detections(found(), [thing(BOX)], view)
     assert not miss.found
-    rows = judge_picture(found((CYC, 0.9, BOX)), [thing(BOX)], view)
+    rows = match_detections(found((CYC, 0.9, BOX)), [thing(BOX)], view)
     assert [(s.kind, s.found) for s in rows] == [(CYC, False), (PED, False)]
     assert math.isnan(rows[0].distance_m)
     assert rows[0].on_other
-    (nobody, _) = judge_picture(found((CYC, 0.9, (10, 300, 30, 350))), [thing(BOX)], view)
+    (nobody, _) = match_detections(found((CYC, 0.9, (10, 300, 30, 350))), [thing(BOX)], view)
     assert not nobody.on_other
     # Moved by shares of his width: overlaps of 0.43, 0.18 and 0.05.
     for shift, loose in ((0.4, True), (0.7, True), (0.9, False)):
         u1, v1, u2, v2 = BOX
         beside = (u1 + shift * (u2 - u1), v1, u2 + shift * (u2 - u1), v2)
-        rows = judge_picture(found((PED, 0.9, beside)), [thing(BOX)], view)
+        rows = match_detections(found((PED, 0.9, beside)), [thing(BOX)], view)
         assert [(s.found, s.loose, s.on_other) for s in rows] == [
             (False, loose, False),
             (False, False, False),
         ]
-    rows = judge_picture(found((PED, 0.9, BOX), (PED, 0.8, BOX)), [thing(BOX)], view)
+    rows = match_detections(found((PED, 0.9, BOX), (PED, 0.8, BOX)), [thing(BOX)], view)
     assert [(s.found, math.isnan(s.distance_m)) for s in rows] == [(False, True), (True, False)]
     assert not rows[0].on_other
 
 
 def test_nobody_is_asked_for_who_cannot_be_seen(view):
     hidden = thing(BOX, visible=0.1)
-    assert judge_picture(found(), [hidden], view) == []
-    assert judge_picture(found((PED, 0.9, BOX)), [hidden], view) == []
-    assert judge_picture(found((CYC, 0.9, BOX)), [hidden], view) == []
+    assert match_detections(found(), [hidden], view) == []
+    assert match_detections(found((PED, 0.9, BOX)), [hidden], view) == []
+    assert match_detections(found((CYC, 0.9, BOX)), [hidden], view) == []
     tiny = thing((400, 300, 403, 310))
     far = thing(BOX, xy=(40.0, 0.0))
-    assert judge_picture(found(), [tiny, far], view) == []
+    assert match_detections(found(), [tiny, far], view) == []
 
 
 def sights():
-    near = [Sight(PED, 5.0, True, 0.5, 0.1), Sight(PED, 14.0, True, 0.2, 0.3)]
-    far = [Sight(PED, 18.0, False, 0.0, NAN), Sight(CYC, 3.0, True, 0.9, NAN)]
+    near = [DetectionRecord(PED, 5.0, True, 0.5, 0.1), DetectionRecord(PED, 14.0, True, 0.2, 0.3)]
+    far = [DetectionRecord(PED, 18.0, False, 0.0, NAN), DetectionRecord(CYC, 3.0, True, 0.9, NAN)]
     return [
         near,
         [
             *far,
-            Sight(CYC, NAN, False, 0.3, NAN),
-            Sight(Kind.VEHICLE, NAN, False, 0.9, NAN),
-            Sight(PED, NAN, False, 0.9, NAN, True),
-            Sight(PED, NAN, False, 0.9, NAN, loose=True),
+            DetectionRecord(CYC, NAN, False, 0.3, NAN),
+            DetectionRecord(Kind.VEHICLE, NAN, False, 0.9, NAN),
+            DetectionRecord(PED, NAN, False, 0.9, NAN, True),
+            DetectionRecord(PED, NAN, False, 0.9, NAN, loose=True),
         ],
     ]
 
@@ -131,7 +131,7 @@ def test_the_summary_counts_at_a_confidence():
 
 def test_those_who_mostly_show_are_counted_apart(view):
     half, whole = thing(BOX, visible=0.5), thing((500, 300, 520, 350))
-    seen = judge_picture(found((PED, 0.7, (500, 300, 520, 350))), [half, whole], view)
+    seen = match_detections(found((PED, 0.7, (500, 300, 520, 350))), [half, whole], view)
     walkers = summary([seen], 0.25)["kinds"]["pedestrian"]
     assert walkers["within_15_m"]["recall"] == 0.5
     assert walkers["within_15_m_mostly_visible"]["objects"] == 1
@@ -139,7 +139,7 @@ def test_those_who_mostly_show_are_counted_apart(view):
 
 
 def test_lights_are_told_apart():
-    rows = by_light(sights(), ["day", "night"], 0.25)
+    rows = summary_by_light(sights(), ["day", "night"], 0.25)
     assert rows["day"] == {
         "frames": 1,
         "false_per_100_frames": 0,
@@ -163,11 +163,14 @@ def test_how_exact_the_figures_are_follows_from_the_streets():
     # in each picture of every tenth street.
     def picture(number):
         street = number // 4
-        false = [Sight(PED, NAN, False, 0.9, NAN)] if street % 10 == 0 else []
-        other = [Sight(PED, NAN, False, 0.9, NAN, True), Sight(CYC, NAN, False, 0.1, NAN)]
-        return [Sight(PED, 5.0, street % 2 == 0, 0.8, 0.1), *false, *other]
+        false = [DetectionRecord(PED, NAN, False, 0.9, NAN)] if street % 10 == 0 else []
+        other = [
+            DetectionRecord(PED, NAN, False, 0.9, NAN, True),
+            DetectionRecord(CYC, NAN, False, 0.1, NAN),
+        ]
+        return [DetectionRecord(PED, 5.0, street % 2 == 0, 0.8, 0.1), *false, *other]
 
-    numbers = spread([picture(n) for n in range(400)], 0.5)
+    numbers = bootstrap_spread([picture(n) for n in range(400)], 0.5)
     low, high = numbers["pedestrian"]
     # A hundred streets, each a throw of a coin: 0.5 +- 1.96 x 0.05.
     assert (low, high) == pytest.approx((0.402, 0.598), abs=0.015)
@@ -175,9 +178,9 @@ def test_how_exact_the_figures_are_follows_from_the_streets():
     # 10 +- 1.96 x 3, skewed.
     assert (low, high) == pytest.approx((5, 16), abs=1.01)
     assert numbers["cyclist"] is None
-    alone = spread([picture(n) for n in range(400)], 0.5, a_street=1)["pedestrian"]
+    alone = bootstrap_spread([picture(n) for n in range(400)], 0.5, a_street=1)["pedestrian"]
     assert alone == pytest.approx([0.45, 0.55], abs=0.01)
-    assert spread(sights(), 0.25) == spread(sights(), 0.25)
+    assert bootstrap_spread(sights(), 0.25) == bootstrap_spread(sights(), 0.25)
 
 
 @pytest.mark.slow

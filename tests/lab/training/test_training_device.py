@@ -13,12 +13,12 @@ from bikeped.lab.training import device  # noqa: E402
 
 
 def test_auto_is_a_device_that_is_there():
-    assert device.named_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert device.resolve_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def test_a_device_that_is_not_there_is_one_line_with_the_mend():
     with pytest.raises(DetectorError, match=r"--device 99: cannot be used \(.*\); use cpu or auto"):
-        device.named_device("99")
+        device.resolve_device("99")
 
 
 @pytest.mark.parametrize(
@@ -35,9 +35,9 @@ def test_sixteen_bits_are_for_processors_that_multiply_them(monkeypatch, tmp_pat
     listed = tmp_path / "cpuinfo"
     listed.write_text(f"processor : 0\n{flags}\n", encoding="ascii")
     monkeypatch.setattr(device, "Path", lambda _: listed)
-    assert device.knows_bfloat16("cpu") is known
+    assert device.supports_bfloat16("cpu") is known
 
 
 def test_where_nothing_lists_the_processor_it_is_float32(monkeypatch, tmp_path):
     monkeypatch.setattr(device, "Path", lambda _: Path(tmp_path) / "none")
-    assert device.knows_bfloat16("cpu") is False
+    assert device.supports_bfloat16("cpu") is False

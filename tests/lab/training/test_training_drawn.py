@@ -10,7 +10,7 @@ from bikeped.config import load_config
 from bikeped.errors import DataSetError
 from bikeped.lab.rendering.render_camera import DEFAULT_POSE
 from bikeped.lab.training.coco import read_coco, read_picture
-from bikeped.lab.training.drawn import DrawnSettings, draw_set, part_camera
+from bikeped.lab.training.drawn import DrawnSettings, draw_training_set, part_camera
 
 LOADED = load_config(None)
 
@@ -39,7 +39,7 @@ def test_parts_have_cameras_of_their_own():
 def test_a_set_is_the_same_whoever_draws_it(tmp_path):
     settings = DrawnSettings(pictures=3, seed=5, part=2, large=0, processes=2)
     seen = []
-    file = draw_set(tmp_path / "a", settings, LOADED, seen.append)
+    file = draw_training_set(tmp_path / "a", settings, LOADED, seen.append)
     assert seen == [2, 3]
     data = read_coco(file)
     assert [image.file_name for image in data.images] == [
@@ -50,14 +50,14 @@ def test_a_set_is_the_same_whoever_draws_it(tmp_path):
     assert list(data.categories.values()) == ["pedestrian", "cyclist", "vehicle"]
     assert read_picture(data.images[2]).shape == (720, 1280, 3)
     alone = DrawnSettings(pictures=3, seed=5, part=2, large=0, processes=1)
-    draw_set(tmp_path / "b", alone, LOADED)
+    draw_training_set(tmp_path / "b", alone, LOADED)
     assert hashes(tmp_path / "a") == hashes(tmp_path / "b")
 
 
 def test_a_folder_that_is_taken_is_left_alone(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(DataSetError, match="is there already"):
-        draw_set(tmp_path, DrawnSettings(pictures=1), LOADED)
+        draw_training_set(tmp_path, DrawnSettings(pictures=1), LOADED)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
     with pytest.raises(DataSetError, match="more than a set can have"):
-        draw_set(tmp_path / "new", DrawnSettings(pictures=10**6), LOADED)
+        draw_training_set(tmp_path / "new", DrawnSettings(pictures=10**6), LOADED)

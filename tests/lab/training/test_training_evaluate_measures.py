@@ -14,9 +14,9 @@ from bikeped.lab.experiments.recall_curve import load_recall_curve
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.training.evaluate import write_curve
 from bikeped.lab.training.measures import (
-    Curve,
-    Found,
-    Truth,
+    DetectionSet,
+    GroundTruth,
+    RecallCurve,
     measure,
     recall_by_distance,
     recall_curve,
@@ -28,7 +28,7 @@ NAMES = ("one", "two")
 
 def truth(*rows):
     """Rows of image, category, box, and crowd where it is one."""
-    return Truth(
+    return GroundTruth(
         np.array([r[0] for r in rows], np.int64),
         np.array([r[1] for r in rows], np.int64),
         np.array([r[2] for r in rows], np.float64).reshape(-1, 4),
@@ -39,7 +39,7 @@ def truth(*rows):
 
 def found(*rows):
     """Rows of image, category, box, score."""
-    return Found(
+    return DetectionSet(
         np.array([r[0] for r in rows], np.int64),
         np.array([r[1] for r in rows], np.int64),
         np.array([r[2] for r in rows], np.float64).reshape(-1, 4),
@@ -112,7 +112,7 @@ def test_nothing_found_and_nothing_there():
     assert (row.ap, row.ap50, row.ar) == (0, 0, 0)
     none = measure(truth(), found((0, 0, BOX, 0.5)), NAMES, 1)
     assert (none.overall.ap, none.overall.ar, none.overall.objects) == (None, None, 0)
-    assert recall_curve(truth(), none.hits, 1) == Curve((), (), (), ())
+    assert recall_curve(truth(), none.hits, 1) == RecallCurve((), (), (), ())
 
 
 def test_false_alarms_are_counted_by_class():
@@ -175,7 +175,7 @@ def test_the_bins_hold_every_object_once_and_rise(areas, least):
 
 @pytest.mark.parametrize("name", ["curve.csv", "curve.json", "curve"])
 def test_the_simulation_reads_the_curve_that_is_written(tmp_path, name):
-    curve = Curve((80.123456789, 1234.5), (1 / 3, 0.75), (0.5, 0.875), (20, 30))
+    curve = RecallCurve((80.123456789, 1234.5), (1 / 3, 0.75), (0.5, 0.875), (20, 30))
     write_curve(tmp_path / name, curve)
     read = load_recall_curve(tmp_path / name)
     assert read == (curve.area_px2, curve.recall)
@@ -191,11 +191,11 @@ def test_the_simulation_reads_the_curve_that_is_written(tmp_path, name):
 
 def test_one_bin_is_no_curve(tmp_path):
     with pytest.raises(DataSetError, match="too few road users"):
-        write_curve(tmp_path / "c.csv", Curve((5.0,), (1.0,), (1.0,), (3,)))
+        write_curve(tmp_path / "c.csv", RecallCurve((5.0,), (1.0,), (1.0,), (3,)))
     assert not (tmp_path / "c.csv").exists()
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycocotools.cocoeval", None)
+    monkeypatch.setitem(sys.modules, "pycocotools", None)
     with pytest.raises(BikepedError, match=r"bikeped\[evaluate\]"):
         measure(truth((0, 0, BOX)), found(), NAMES, 1)

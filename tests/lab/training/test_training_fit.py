@@ -23,7 +23,12 @@ from bikeped.lab.training.fit import (  # noqa: E402
     learning_rate,
 )
 from bikeped.lab.training.packing import PackSettings  # noqa: E402
-from bikeped.lab.training.weights import is_small, load_weights, save_weights  # noqa: E402
+from bikeped.lab.training.weights import (  # noqa: E402
+    SmallDetector,
+    is_small,
+    load_weights,
+    save_weights,
+)
 
 CROPS = CropSettings(view=(160, 96), window=(96, 64), light=0, cover=0)
 PACK = PackSettings(side=128, squares=2, pool=4)
@@ -143,8 +148,9 @@ def test_the_rate_rises_then_falls():
 
 def test_weights_come_back_as_they_were(fitted, tmp_path):
     path = tmp_path / "weights.pt"
-    save_weights(fitted.network, fitted.names, fitted.size, path, {"seed": 3})
-    network, names, size, facts = load_weights(path)
+    save_weights(SmallDetector(fitted.network, fitted.names, fitted.size, {"seed": 3}), path)
+    found = load_weights(path)
+    network, names, size, facts = found.network, found.names, found.size, found.facts
     assert (names, size, facts) == (("pedestrian", "cyclist"), (160, 96), {"seed": 3})
     assert is_small(path)
     for key, value in fitted.network.state_dict().items():
@@ -162,7 +168,7 @@ def test_files_that_are_no_weights_are_named(tmp_path, fitted):
     assert not is_small(path)
     with pytest.raises(DetectorError, match="model train --network small"):
         load_weights(path)
-    save_weights(fitted.network, fitted.names, fitted.size, path, {})
+    save_weights(SmallDetector(fitted.network, fitted.names, fitted.size), path)
     body = torch.load(path, weights_only=True)
     torch.save(body | {"names": ["one"]}, path)
     with pytest.raises(DetectorError, match="do not fit"):
@@ -187,7 +193,7 @@ def test_unusable_data_are_named(data, tmp_path):
 
 def test_an_exported_file_is_what_the_detector_loads(fitted, tmp_path):
     weights, model = tmp_path / "weights.pt", tmp_path / "model.onnx"
-    save_weights(fitted.network, fitted.names, fitted.size, weights, {"seed": 3})
+    save_weights(SmallDetector(fitted.network, fitted.names, fitted.size, {"seed": 3}), weights)
     summary = export_weights(weights, model)
     assert summary.box_difference_px < 0.01
     assert summary.bytes == model.stat().st_size
@@ -204,7 +210,7 @@ def test_nothing_is_written_where_runtime_and_pytorch_disagree(fitted, tmp_path,
     monkeypatch.setattr(onnx_file, "_MOST_SCORE", -1.0)
     model = tmp_path / "model.onnx"
     with pytest.raises(DetectorError, match=r"model\.onnx: ONNX Runtime's answer differs"):
-        export_network(fitted.network, fitted.names, fitted.size, model, {})
+        export_network(SmallDetector(fitted.network, fitted.names, fitted.size), model)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -213,7 +219,7 @@ def test_it_learns(data, tmp_path):
     settings = replace(SETTINGS, steps=240, pictures=4, rate=4e-3, warmup=10, memory=0.95)
     fitted = fit(data, settings)
     model = tmp_path / "model.onnx"
-    export_network(fitted.network, fitted.names, fitted.size, model, {})
+    export_network(SmallDetector(fitted.network, fitted.names, fitted.size), model)
     detector = load_detector(DetectionConfig(model=str(model), confidence=0.3), tmp_path)
     unseen = blobs(tmp_path / "test", 12, 99)
     right, wrong = 0, 0

@@ -7,11 +7,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
 from bikeped.lab.training.loss import (  # noqa: E402
-    Truth,
+    ImageLabels,
     assign,
     detection_loss,
-    generalised_overlap,
-    pair_overlap,
+    generalised_iou,
+    pairwise_iou,
 )
 from bikeped.lab.training.network import grid  # noqa: E402
 
@@ -21,7 +21,7 @@ NONE = torch.zeros(0, 4)
 
 def truth(*boxes, classes=None, ignored=NONE):
     ids = torch.tensor(classes or [0] * len(boxes))
-    return Truth(torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4), ids, ignored)
+    return ImageLabels(torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4), ids, ignored)
 
 
 def perfect(what, sure=8.0):
@@ -44,12 +44,12 @@ def loss_of(score, edge, what):
 def test_overlaps():
     a = torch.tensor([[0.0, 0, 10, 10], [20, 20, 30, 30]])
     b = torch.tensor([[5.0, 0, 15, 10], [20, 20, 30, 30]])
-    assert pair_overlap(a, b)[0, 0].item() == pytest.approx(1 / 3)
-    assert pair_overlap(a, b)[0, 1].item() == 0
-    same = generalised_overlap(a, b)
+    assert pairwise_iou(a, b)[0, 0].item() == pytest.approx(1 / 3)
+    assert pairwise_iou(a, b)[0, 1].item() == 0
+    same = generalised_iou(a, b)
     assert same[1].item() == pytest.approx(1)
     assert same[0].item() == pytest.approx(1 / 3)  # the hull is the union
-    far = generalised_overlap(torch.tensor([[0.0, 0, 1, 1]]), torch.tensor([[9.0, 0, 10, 1]]))
+    far = generalised_iou(torch.tensor([[0.0, 0, 1, 1]]), torch.tensor([[9.0, 0, 10, 1]]))
     assert far.item() == pytest.approx(-0.8)
 
 

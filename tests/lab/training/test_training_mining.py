@@ -12,10 +12,10 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 from test_training_fit import CROPS, SETTINGS, blobs  # noqa: E402
 
 from bikeped.geometry.boxes import iou_matrix  # noqa: E402
-from bikeped.lab.training.coco import MISTAKEN, furniture  # noqa: E402
-from bikeped.lab.training.crops import Cutter, read_view, usual_places  # noqa: E402
+from bikeped.lab.training.coco import FALSE_POSITIVE, furniture  # noqa: E402
+from bikeped.lab.training.crops import Cropper, object_centres, read_sample  # noqa: E402
 from bikeped.lab.training.fit import fit, shown_size  # noqa: E402
-from bikeped.lab.training.hard_negative_mining import MiningSettings, with_mistakes  # noqa: E402
+from bikeped.lab.training.hard_negative_mining import MiningSettings, mine_false_positives  # noqa: E402
 from bikeped.lab.training.network import shift_scores  # noqa: E402
 from bikeped.lab.training.packing import Packer, PackSettings  # noqa: E402
 
@@ -40,11 +40,13 @@ def eager(data):
 
 @pytest.fixture(scope="module")
 def mined(data, eager):
-    return with_mistakes(eager, data, (160, 96), ALL)
+    return mine_false_positives(eager, data, (160, 96), ALL)
 
 
 def mistakes(image):
-    return np.array([box for what, box in furniture(image) if what == MISTAKEN]).reshape(-1, 4)
+    return np.array([box for what, box in furniture(image) if what == FALSE_POSITIVE]).reshape(
+        -1, 4
+    )
 
 
 def test_a_mistake_is_on_nobody(data, mined):
@@ -67,12 +69,12 @@ def test_a_further_look_forgets_the_one_before_and_keeps_what_stands_there(data,
             for i in mined[0].images
         ),
     )
-    again, count = with_mistakes(eager, told, (160, 96), replace(ALL, processes=2))
+    again, count = mine_false_positives(eager, told, (160, 96), replace(ALL, processes=2))
     assert count == mined[1]
     for image, first in zip(again.images, mined[0].images, strict=True):
         assert furniture(image)[0] == ("bin", (3.0, 4.0, 23.0, 34.0))
         assert np.allclose(mistakes(image), mistakes(first))
-    sure, none = with_mistakes(eager, told, (160, 96), replace(ALL, confidence=1.0))
+    sure, none = mine_false_positives(eager, told, (160, 96), replace(ALL, confidence=1.0))
     assert none == 0
     assert not any(len(mistakes(image)) for image in sure.images)
 
@@ -82,18 +84,18 @@ def test_windows_are_cut_around_mistakes(mined):
     image = next(i for i in told.images if len(mistakes(i)))
     (first, *_) = mistakes(image)
     image = replace(
-        image, entry={"furniture": [{"what": MISTAKEN, "bbox": [first[0], first[1], 12, 9]}]}
+        image, entry={"furniture": [{"what": FALSE_POSITIVE, "bbox": [first[0], first[1], 12, 9]}]}
     )
-    view = read_view(told, image, (160, 96))
-    assert view.mistaken_px.tolist() == [[first[0], first[1], first[0] + 12, first[1] + 9]]
+    view = read_sample(told, image, (160, 96))
+    assert view.false_positive_px.tolist() == [[first[0], first[1], first[0] + 12, first[1] + 9]]
     # A white spot where the mistake is: every window shows all of it.
-    u1, v1, u2, v2 = np.array(view.mistaken_px[0]).round().astype(int)
+    u1, v1, u2, v2 = np.array(view.false_positive_px[0]).round().astype(int)
     rgb = np.zeros_like(view.rgb)
     rgb[v1:v2, u1:u2] = 255
     view = replace(view, rgb=rgb)
     white = (rgb > 127).sum()
     crops = replace(CROPS, scale=(1.0, 1.0), around_mistaken=1.0)
-    cutter = Cutter(crops, 0, usual_places(told, (160, 96)))
+    cutter = Cropper(crops, 0, object_centres(told, (160, 96)))
     for seed in range(20):
         crop = cutter(view, np.random.default_rng(seed))
         assert (crop.rgb > 127).sum() == pytest.approx(white, rel=0.25)

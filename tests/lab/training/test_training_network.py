@@ -11,7 +11,7 @@ from bikeped.detection.model_metadata import ModelMetadata  # noqa: E402
 from bikeped.detection.output_layouts import anchor_count, choose_layout, decode  # noqa: E402
 from bikeped.lab.training.network import (  # noqa: E402
     STRIDES,
-    Exported,
+    ExportModule,
     SmallNet,
     boxes_px,
     grid,
@@ -72,7 +72,7 @@ def test_edges_are_strides_from_the_cells_own_centre():
 def test_the_answer_is_what_the_detector_reads_as_yolov8(network):
     with torch.no_grad():
         picture = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(1))
-        answer = Exported(network).eval()(picture).numpy()
+        answer = ExportModule(network).eval()(picture).numpy()
         score, edge = network(picture)
     facts = ModelMetadata(names=("pedestrian", "cyclist", "vehicle"), ultralytics=True)
     assert choose_layout(answer, SIZE, facts, "auto", "test").layout == "yolov8"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.lab.training.crops import CropSettings, Cutter, View
+from bikeped.lab.training.crops import Cropper, CropSettings, Sample
 from bikeped.lab.training.packing import BLOCK_PX, Packer, PackSettings, first_fit
 
 CROPS = CropSettings(view=(480, 320), scale=(1.0, 1.0), flip=0.0, cover=0, light=0)
@@ -22,11 +22,11 @@ def street(boxes, kind=0, crowd=0):
     for u1, v1, u2, v2 in boxes:
         rgb[v1:v2, u1:u2] = 255
     many = np.full(len(boxes), crowd)
-    return View(rgb, np.array(boxes, float).reshape(-1, 4), np.full(len(boxes), kind), many)
+    return Sample(rgb, np.array(boxes, float).reshape(-1, 4), np.full(len(boxes), kind), many)
 
 
 def packer(pack=PLAIN, crops=CROPS):
-    return Packer(pack, crops, Cutter(crops, 0, np.array([[200.0, 100.0]])))
+    return Packer(pack, crops, Cropper(crops, 0, np.array([[200.0, 100.0]])))
 
 
 SMALL = street([(100, 100, 120, 140)])
@@ -107,10 +107,12 @@ def test_places_never_overlap(sizes):
 
 
 def test_a_window_holds_its_object_whole_wherever_it_lies():
-    cutter = Cutter(CROPS, 0, np.zeros((0, 2)))
+    cropper = Cropper(CROPS, 0, np.zeros((0, 2)))
     random = np.random.default_rng(1)
     for _ in range(50):
-        crop = cutter(SMALL, random, window=(BLOCK_PX, BLOCK_PX), around=SMALL.box_px[0], scale=1.0)
+        crop = cropper(
+            SMALL, random, window=(BLOCK_PX, BLOCK_PX), around=SMALL.box_px[0], scale=1.0
+        )
         assert crop.box_px[0, 2:] - crop.box_px[0, :2] == pytest.approx([20, 40])
 
 

@@ -14,7 +14,8 @@ from bikeped.errors import DetectorError  # noqa: E402
 from bikeped.lab.training.coco import read_coco  # noqa: E402
 from bikeped.lab.training.export import export_network  # noqa: E402
 from bikeped.lab.training.network import SmallNet  # noqa: E402
-from bikeped.lab.training.quantise import quantise, shown_pictures  # noqa: E402
+from bikeped.lab.training.quantise import calibration_images, quantise  # noqa: E402
+from bikeped.lab.training.weights import SmallDetector  # noqa: E402
 
 ort = pytest.importorskip("onnxruntime")
 SIZE = (128, 96)
@@ -31,7 +32,8 @@ def both(tmp_path_factory, pictures):
     folder = tmp_path_factory.mktemp("int8")
     torch.manual_seed(4)
     network = SmallNet(3).eval()
-    export_network(network, ("pedestrian", "cyclist", "vehicle"), SIZE, folder / "f.onnx", {})
+    detector = SmallDetector(network, ("pedestrian", "cyclist", "vehicle"), SIZE)
+    export_network(detector, folder / "f.onnx")
     written = quantise(folder / "f.onnx", pictures, folder / "q.onnx")
     assert written == (folder / "q.onnx").stat().st_size
     return folder / "f.onnx", folder / "q.onnx"
@@ -86,6 +88,6 @@ def test_another_model_is_refused(tmp_path, pictures):
 
 def test_pictures_are_shown_as_the_detector_shows_them(tmp_path):
     data = read_coco(write_set(tmp_path / "set", [annotation(1, 1, 1, [20, 30, 40, 50])], images=4))
-    shown = list(shown_pictures(data, SIZE, 2))
+    shown = list(calibration_images(data, SIZE, 2))
     assert 1 <= len(shown) <= 3
     assert all(p.shape == (1, 3, SIZE[1], SIZE[0]) and 0 <= p.min() <= p.max() <= 1 for p in shown)

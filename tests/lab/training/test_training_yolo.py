@@ -25,7 +25,7 @@ from bikeped.lab.training.coco import read_coco
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
 from bikeped.lab.training import yolo  # noqa: E402
-from bikeped.lab.training.yolo import YoloOrder, export_yolo, train_yolo, write_data  # noqa: E402
+from bikeped.lab.training.yolo import YoloTrainSettings, export_yolo, train_yolo, write_data  # noqa: E402
 
 
 class Network(torch.nn.Module):
@@ -144,7 +144,9 @@ def test_names_that_yaml_would_misread(tmp_path):
 
 def test_training_asks_for_what_was_ordered_and_leaves_a_model(data, tmp_path):
     out = tmp_path / "out"
-    order = YoloOrder("yolov9-t", size=64, epochs=2, batch=4, device="cpu", workers=0, seed=5)
+    order = YoloTrainSettings(
+        "yolov9-t", size=64, epochs=2, batch=4, device="cpu", workers=0, seed=5
+    )
     summary = train_yolo(data, None, out, order)
     trained = LibreYOLO9.made[0]
     assert (trained.weights, trained.size, trained.device) == (None, "t", "cpu")
@@ -179,7 +181,7 @@ def test_training_asks_for_what_was_ordered_and_leaves_a_model(data, tmp_path):
 
 def test_weights_to_start_from(data, tmp_path):
     start = tmp_path / "start.pt"
-    order = YoloOrder("yolov9-s", size=64, epochs=1, weights=start)
+    order = YoloTrainSettings("yolov9-s", size=64, epochs=1, weights=start)
     with pytest.raises(DetectorError, match=r"start\.pt: does not exist"):
         train_yolo(data, None, tmp_path / "out", order)
     start.write_bytes(b"weights")
@@ -190,12 +192,12 @@ def test_weights_to_start_from(data, tmp_path):
 def test_no_weights_left_is_an_error(data, tmp_path, monkeypatch):
     monkeypatch.setattr(LibreYOLO9, "train", lambda self, **asked: {})
     with pytest.raises(DetectorError, match="left no weights"):
-        train_yolo(data, None, tmp_path / "out", YoloOrder(size=64))
+        train_yolo(data, None, tmp_path / "out", YoloTrainSettings(size=64))
 
 
 def test_an_odd_size_or_one_picture_is_refused(data, tmp_path):
     with pytest.raises(DataSetError, match="multiple of 32"):
-        train_yolo(data, None, tmp_path / "out", YoloOrder(size=100))
+        train_yolo(data, None, tmp_path / "out", YoloTrainSettings(size=100))
     one = read_coco(write_set(tmp_path / "one", [], images=1))
     with pytest.raises(DataSetError, match="--validation"):
         write_data(one, None, tmp_path / "out", 0)
