@@ -17,10 +17,11 @@ from bikeped.tracking import TrackerSettings
 from bikeped.types import Region
 
 
-def rule_settings(decision: DecisionConfig) -> RuleSettings:
+def rule_settings(decision: DecisionConfig, speed_window_frames: int = 4) -> RuleSettings:
     """The decision's parameters in seconds.
 
-    Speed is the displacement over the last 4 positions (definitions, section 8): 3 nominal frames.
+    A cyclist's speed is the displacement between positions `speed_window_frames` nominal frames
+    apart (definitions, section 8: 4); on the pole it is `tracking.speed_window_frames`.
     """
     fps = decision.nominal_fps
     return RuleSettings(
@@ -34,7 +35,7 @@ def rule_settings(decision: DecisionConfig) -> RuleSettings:
         speed_adaptive=decision.speed_adaptive,
         reaction_s=decision.reaction_s,
         deceleration_mps2=decision.deceleration_mps2,
-        speed_window_s=3 / fps,
+        speed_window_s=speed_window_frames / fps,
         ttc_s=decision.ttc_s,
     )
 

@@ -43,7 +43,7 @@ class RuleSettings:
     speed_adaptive: bool = True
     reaction_s: float = 0.84
     deceleration_mps2: float = 1.96
-    speed_window_s: float = 3 / 30
+    speed_window_s: float = 4 / 30
     ttc_s: float = 3.0
 
 

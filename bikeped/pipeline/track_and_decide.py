@@ -55,7 +55,7 @@ class TrackAndDecide:
         )
         self._speed_window_s = config.tracking.speed_window_frames / fps
         self._history = config.tracking.history_frames
-        self._rule = rule_settings(config.decision)
+        self._rule = rule_settings(config.decision, config.tracking.speed_window_frames)
         self._latency = config.latency
         self._fixed_ahead_s = config.latency.frames / fps
         self.reset()

@@ -110,7 +110,8 @@ def test_settings_of_the_core_are_in_seconds():
     rule = rule_settings(Config().decision)
     assert rule.memory_s == 58 / 30
     assert rule.lookback_s == 2 / 30
-    assert rule.speed_window_s == 3 / 30
+    assert rule.speed_window_s == 4 / 30  # definitions, section 8: positions 4 frames apart
+    assert rule_settings(Config().decision, 9).speed_window_s == 9 / 30
     slow = parse(with_key("decision.nominal_fps", 15)).config
     assert rule_settings(slow.decision).memory_s == 58 / 15
     tracker = tracker_settings(Config().tracking)

@@ -111,11 +111,11 @@ def test_a_slow_cyclist_does_not_lower_d_max():
     assert last_state(SELECTED, frames) is State.ALERT
 
 
-def test_speed_is_over_the_last_four_positions():
-    # At rest, then 9 m/s for one frame: a third of it over three frames.
+def test_speed_is_between_positions_four_frames_apart():
+    # At rest, then 9 m/s for one frame: a quarter of it over four frames (definitions, section 8).
     ys = [0.0] * 6 + [0.3]
     frames = pair(lambda t: (0.0, ys[round(t * 30)]), still(5.0, 5.0), 7)
-    assert run(SELECTED, frames)[-1].pair.speed_mps == pytest.approx(3.0)
+    assert run(SELECTED, frames)[-1].pair.speed_mps == pytest.approx(2.25)
 
 
 # ---- displacement

@@ -93,3 +93,24 @@ def test_the_rule_is_asked_about_the_place_ahead_by_age_and_offset_up_to_the_bou
         tracking = track_and_decide.update_from_points(points, frame / 30, age_s)
     gap_m = asked[-1][0] - tracking.tracks.xy_m[0]
     assert gap_m == pytest.approx([0.0, 4.0 * ahead_s], abs=0.02)
+
+
+@pytest.mark.parametrize(("frames", "speed_mps"), [(1, 9.0), (2, 4.5), (4, 2.25)])
+def test_the_speed_window_reaches_the_rule(frames, speed_mps):
+    """A cyclist at rest who then rides 0.3 m in a frame, and a pedestrian ahead."""
+    loaded = load_config(
+        None,
+        [
+            f"tracking.speed_window_frames={frames}",
+            "tracking.position_weight=1",
+            "tracking.confirm_hits=1",
+            "decision.lookback_frames=1",
+        ],
+    )
+    track_and_decide = TrackAndDecide(loaded)
+    for frame in range(8):
+        xy = np.array([[5.0, 0.3 if frame == 7 else 0.0], [5.0, 5.0]])
+        points = GroundPoints(np.array([C, P], np.int8), xy, np.arange(2))
+        decision = track_and_decide.update_from_points(points, frame / 30).decision
+    assert decision.pair is not None
+    assert decision.pair.speed_mps == pytest.approx(speed_mps)

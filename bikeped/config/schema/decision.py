@@ -41,7 +41,12 @@ class TrackingConfig(Section, frozen=True):
     ] = 0.2
     speed_window_frames: Annotated[
         int,
-        Meta(ge=1, le=60, description="reported velocity is the displacement over these frames"),
+        Meta(
+            ge=1,
+            le=60,
+            description="speed and velocity are the displacement over these nominal frames: a "
+            "cyclist's in the stopping distance, and the published one",
+        ),
     ] = 4
     history_frames: Annotated[
         int, Meta(ge=2, le=300, description="positions kept and published of each track")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,10 @@ from bikeped.config.load import read_text
 from bikeped.config.provenance import (
     DECIDING_CODE,
     MEASURING_CODE,
-    camera_hash,
     code_hash,
     decision_hash,
     provenance_path,
+    setting_hashes,
 )
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.files import write_like
@@ -46,20 +46,19 @@ def provenance_record(
     loaded: LoadedConfig,
     files: Sequence[tuple[str, Path]] = (),
 ) -> dict[str, Any]:
-    """Everything that a promotion rests on: suite, optimiser trace, calibration, code, figures.
+    """Everything that a promotion rests on: suite, settings, calibration, code, figures.
 
     `files` are further files to name by their hash: `candidate`, `trace`.
     """
-    after = msgspec.structs.replace(loaded.config, decision=decision)
+    after = replace(loaded, config=msgspec.structs.replace(loaded.config, decision=decision))
     return {
         "format": 1,
         "promoted_at": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "decision": msgspec.to_builtins(decision),
-        "decision_hash": decision_hash(decision),
+        **setting_hashes(after),
         "decision_hash_before": decision_hash(loaded.config.decision),
-        "config_hash": config_hash(after, loaded.calibration_hash),
+        "config_hash": config_hash(after.config, loaded.calibration_hash),
         "calibration_hash": loaded.calibration_hash,
-        "camera_hash": camera_hash(loaded),
         "camera": camera_json(suite),
         "suite_hash": suite.hash,
         "scenarios": len(suite.scenarios),

@@ -111,7 +111,14 @@ def test_provenance_names_what_the_promotion_rests_on(place):
     ("change", "said"),
     [
         (("  d_max_m: 24.8", "  d_max_m: 23.0"), "differs from the promoted"),
-        (("  height_m: 3.6576", "  height_m: 4.2"), "camera"),
+        (("  height_m: 3.6576", "  height_m: 4.2"), "the camera or its calibration"),
+        (("  height_m: 3.6576", "  height_m: 3.6576\n  crop_size: 3499"), "the camera or"),
+        (("  height_m: 3.6576", "  height_m: 3.6576\n  table_step_px: 9"), "the camera or"),
+        (("feedback:", "tracking:\n  velocity_weight: 0.5\nfeedback:"), "the tracking section"),
+        (("feedback:", "latency:\n  compensation: measured\nfeedback:"), "the latency section"),
+        (("feedback:", "detection:\n  cyclist: [rider]\nfeedback:"), "the detector"),
+        (("feedback:", "detection:\n  model: bundled\nfeedback:"), "the detector"),
+        (("feedback:", f"detection:\n  sha256: {'a' * 64}\nfeedback:"), "the detector"),
     ],
 )
 def test_a_change_after_the_promotion_is_noticed(place, change, said):
@@ -123,6 +130,52 @@ def test_a_change_after_the_promotion_is_noticed(place, change, said):
     found = check_provenance(load_config(path))
     assert not found.holds
     assert said in found.text
+    assert "promote" in found.text
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("feedback:", "detection:\n  providers: [cpu]\nfeedback:"),
+        ("feedback:", "mqtt:\n  site: elsewhere\nfeedback:"),
+        ("  height_m: 3.6576", "  height_m: 3.6576\n  source: /dev/video7\n  fps: 25"),
+        ("# A city's own remark on top.", "# Another remark."),
+    ],
+)
+def test_what_decides_nothing_may_change_after_the_promotion(place, change):
+    assert run("promote", place / "good.yaml", *options(place)) == 0
+    path = place / "config.yaml"
+    path.write_text(path.read_text().replace(*change))
+    assert check_provenance(load_config(path)).holds
+
+
+def test_the_model_file_and_the_lens_file_count_by_their_content(place):
+    (place / "net.onnx").write_bytes(b"one")
+    lens = {"model": "equidistant", "cx": 1750, "cy": 1750, "focal_length": 1013, "fov_deg": 197.9}
+    (place / "lens.json").write_text(json.dumps(lens))
+    path = place / "config.yaml"
+    more = "  calibration: lens.json\n\ndetection:\n  model: net.onnx\n"
+    path.write_text(CONFIG.replace("  height_m: 3.6576\n", "  height_m: 3.6576\n" + more))
+    assert run("promote", place / "good.yaml", *options(place)) == 0
+    assert check_provenance(load_config(path)).holds
+    (place / "net.onnx").write_bytes(b"two")
+    assert "but the detector changed" in check_provenance(load_config(path)).text
+    (place / "net.onnx").write_bytes(b"one")
+    (place / "lens.json").write_text(json.dumps({**lens, "focal_length": 1014}))
+    assert "but the camera or its calibration changed" in check_provenance(load_config(path)).text
+
+
+@pytest.mark.parametrize("missing", ["tracking_hash", "latency_hash", "detector_hash"])
+def test_an_older_provenance_is_answered_with_promote_again(place, missing):
+    assert run("promote", place / "good.yaml", *options(place)) == 0
+    file = place / "config.provenance.json"
+    record = json.loads(file.read_text())
+    del record[missing]
+    file.write_text(json.dumps(record))
+    found = check_provenance(load_config(place / "config.yaml"))
+    assert not found.holds
+    assert found.text.endswith("did not record tracking, latency and detector: promote again")
+    assert "\n" not in found.text
 
 
 def test_an_override_at_start_is_noticed(place):
