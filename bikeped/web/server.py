@@ -138,12 +138,8 @@ async def json_body(request: web.Request, kind: type[T]) -> T:
 
 def json_answer(data: Any, status: int = 200) -> web.Response:
     """`data` (anything msgspec encodes) as JSON that browsers do not cache."""
-    return web.Response(
-        status=status,
-        body=msgspec.json.encode(data),
-        content_type="application/json",
-        headers={hdrs.CACHE_CONTROL: "no-store"},
-    )
+    body = msgspec.json.encode(data)
+    return web.Response(status=status, body=body, content_type="application/json")
 
 
 @web.middleware

@@ -1,9 +1,8 @@
-"""`bikeped testbench`: the browser test bench, challenges on the command line, and the report."""
+"""`bikeped testbench`: the browser test bench, saved challenges, and the HTML report."""
 
 from __future__ import annotations
 
 import contextlib
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +19,7 @@ from bikeped.lab.cli.governance_tables import print_comparison
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 
 if TYPE_CHECKING:
+    from bikeped.lab.testbench.comparison import InvocationOptions
     from bikeped.lab.testbench.settings import BenchSettings
 
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @config_options
 @scenarios_option
 @click.option("--port", type=click.IntRange(0, 65535), help="Port to serve; 0: any free one.")
-@click.option("--host", help="Address to serve; any but this machine's own needs web.token_file.")
+@click.option("--host", help="Address to serve; all but loopback addresses need web.token_file.")
 @guarded
 def command(
     config_path: Path | None,
@@ -36,31 +36,28 @@ def command(
     port: int | None,
     host: str | None,
 ) -> None:
-    """Serve the test bench: see why the light goes red, change anything, contest it.
+    """Serve the test bench in a browser: play scenarios, change settings, compare results.
 
-    It computes with the deployed code and touches no running service.
+    It runs the deployed tracker and rules on simulated scenarios, and changes no running service.
     """
     context = click.get_current_context()
     if context.invoked_subcommand is not None:
         if config_path or overrides or scenarios_dir or port is not None or host:
             raise BikepedError(
-                f"testbench: write options behind the command: bikeped testbench "
+                f"testbench: write options after the subcommand: bikeped testbench "
                 f"{context.invoked_subcommand} ... -c FILE"
             )
         return
     import msgspec
 
-    from bikeped.lab.testbench.contest import InvocationOptions
     from bikeped.lab.testbench.pages import add_testbench
     from bikeped.web.serve import serve_pages
 
-    loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
-    web = loaded.config.web
-    if port is not None:
-        web = msgspec.structs.replace(web, port=port)
-    if host is not None:
-        web = msgspec.structs.replace(web, host=host)
-    origin = InvocationOptions(config_path, scenarios_dir, overrides)
+    loaded, scenarios, origin = _load(config_path, overrides, scenarios_dir)
+    given = {"port": port, "host": host}
+    web = msgspec.structs.replace(
+        loaded.config.web, **{key: value for key, value in given.items() if value is not None}
+    )
     screen = console()
     serve_pages(
         web,
@@ -86,28 +83,27 @@ def contest(
     scenarios_dir: Path | None,
     json_path: str | None,
 ) -> None:
-    """Rerun a challenge that the test bench saved: the whole suite, before and after.
+    """Run the suite with settings saved by the test bench, and compare before and after.
 
-    FILE_OR_LINK is the file, or the page's address with all that follows its #.
+    FILE_OR_LINK is the saved file, or the page's address with all that follows its #.
     """
-    from bikeped.lab.testbench.contest import InvocationOptions
-    from bikeped.lab.testbench.contest import challenge as run
-    from bikeped.lab.testbench.run import BenchRunner, trial_summaries
+    from bikeped.lab.testbench.comparison import compare_settings
+    from bikeped.lab.testbench.runner import BenchRunner, trial_summaries
     from bikeped.lab.testbench.settings import settings_from_link, settings_in_force
 
     file = _as_file(challenge)
-    loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
-    bench = (
-        settings_from_link(challenge, settings_in_force(loaded)) if file is None else _read(file)
-    )
+    loaded, scenarios, origin = _load(config_path, overrides, scenarios_dir)
+    if file is None:
+        bench = settings_from_link(challenge, settings_in_force(loaded))
+    else:
+        bench = _read(file)
     work = BenchRunner(loaded, scenarios)
-    found = run(work, bench).as_dict()
+    comparison = compare_settings(work, bench).as_dict()
     trials = trial_summaries(work.whole(bench), bench)
-    origin = InvocationOptions(config_path, scenarios_dir, overrides)
-    words = shlex.join(["bikeped", "testbench", "contest", challenge, *origin.options()])
+    words = origin.command_line("testbench", "contest", challenge)
     if json_path is not None:
-        write_json({"command": words, **found, "trials": trials}, json_path)
-    print_comparison(found, words, console(json_path))
+        write_json({"command": words, **comparison, "trials": trials}, json_path)
+    print_comparison(comparison, words, console(json_path))
     if trials is not None:
         mean = trials["sensitivity"]
         if mean["mean"] is not None:
@@ -129,15 +125,16 @@ def export(
     scenarios_dir: Path | None,
     json_path: str | None,
 ) -> None:
-    """Write one self-contained page: every scenario's playback, figures, gates, residual risks.
+    """Write an HTML report in one file: playback of every scenario, figures, gates, risks.
 
-    It opens from the disk without a network, to be mailed or printed.
+    It needs no network and no server.
     """
     from bikeped.lab.testbench.export import render_report
 
-    loaded, scenarios = _begin(config_path, overrides, scenarios_dir)
-    with progress_bar("scenarios", len(scenarios)) as tell:
-        page = render_report(loaded, scenarios, _again(config_path, overrides, scenarios_dir), tell)
+    loaded, scenarios, origin = _load(config_path, overrides, scenarios_dir)
+    command_line = origin.command_line("testbench", "export", "report.html")
+    with progress_bar("scenarios", len(scenarios)) as progress:
+        page = render_report(loaded, scenarios, command_line, progress)
     write_whole(out, page)
     size_mb = len(page.encode()) / 1e6
     if json_path is not None:
@@ -145,15 +142,18 @@ def export(
     console(json_path).print(f"{escape(str(out))}: {len(scenarios)} scenarios, {size_mb:.1f} MB")
 
 
-def _begin(
+def _load(
     config_path: Path | None, overrides: tuple[str, ...], scenarios_dir: Path | None
-) -> tuple[LoadedConfig, list[Scenario]]:
+) -> tuple[LoadedConfig, list[Scenario], InvocationOptions]:
+    from bikeped.lab.testbench.comparison import InvocationOptions
+
     loaded = load_config(config_path, overrides)
-    return loaded, load_scenarios(scenarios_dir or bundled_folder())
+    scenarios = load_scenarios(scenarios_dir or bundled_folder())
+    return loaded, scenarios, InvocationOptions(config_path, scenarios_dir, overrides)
 
 
 def _as_file(challenge: str) -> Path | None:
-    """The file that is meant; None for a link."""
+    """`challenge` as a path; None when it is a link."""
     if "=" not in challenge and "#" not in challenge:
         return Path(challenge)
     with contextlib.suppress(OSError, ValueError):  # a link can be longer than any name
@@ -171,12 +171,3 @@ def _read(path: Path) -> BenchSettings:
         return settings_from_file(path.read_bytes(), str(path))
     except OSError as error:
         raise BikepedError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-
-
-def _again(config_path: Path | None, overrides: tuple[str, ...], scenarios_dir: Path | None) -> str:
-    words = ["bikeped", "testbench", "export", "report.html"]
-    words += ["-c", str(config_path)] if config_path is not None else []
-    words += ["--scenarios", str(scenarios_dir)] if scenarios_dir is not None else []
-    for item in overrides:
-        words += ["--set", item]
-    return shlex.join(words)

@@ -31,10 +31,10 @@ from bikeped.lab.experiments.report import (
 )
 from bikeped.lab.result_tables import ExperimentResult
 from bikeped.lab.scenarios.scenario import Scenario
-from bikeped.lab.testbench.contest import encode_runs
+from bikeped.lab.testbench.comparison import encode_runs
 from bikeped.lab.testbench.pages import configurations
 from bikeped.lab.testbench.playback import coverage, playback
-from bikeped.lab.testbench.run import BenchRunner, BenchSuite
+from bikeped.lab.testbench.runner import BenchRunner, BenchSuite
 from bikeped.lab.testbench.settings import settings_in_force
 from bikeped.templates import render
 from bikeped.web.server import WEB_FOLDER

@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -26,9 +27,9 @@ from bikeped.config.schema.base import Section
 from bikeped.lab.experiments.optimizer import BOUNDS
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.lab.testbench.contest import InvocationOptions, comparison_json
+from bikeped.lab.testbench.comparison import InvocationOptions, comparison_json
 from bikeped.lab.testbench.playback import TESTS, TIERS, coverage, playback
-from bikeped.lab.testbench.run import BenchRunner, trial_summaries
+from bikeped.lab.testbench.runner import BenchRunner, trial_summaries
 from bikeped.lab.testbench.settings import (
     MAX_SCRIPT_CHARS,
     BenchSettings,
@@ -56,14 +57,14 @@ PAGE = Page(
 
 
 class BenchRequest(Section, frozen=True):
-    """A request about a bench. `client` tells pages apart."""
+    """A request to run with these settings; `client` identifies the browser page."""
 
     bench: BenchSettings
     client: Annotated[str, Meta(max_length=40)] = ""
 
 
 class TextRequest(Section, frozen=True):
-    """A text that somebody brought: a scenario file, a challenge, a link."""
+    """An uploaded text: a scenario file, saved settings, or a link."""
 
     text: Annotated[str, Meta(max_length=900_000)]
     name: Annotated[str, Meta(max_length=120)] = "file"
@@ -76,73 +77,68 @@ def add_testbench(
     origin: InvocationOptions = InvocationOptions(),  # noqa: B008 - immutable
 ) -> None:
     """Adds the page and its API; `loaded` is the configuration in force, `scenarios` the suite."""
-    # One for the scenario shown and one for the suite: neither waits for what the other keeps.
+    # A runner for the scenario shown and one for the suite: neither waits for the other's lock.
     shown, work = BenchRunner(loaded, scenarios), BenchRunner(loaded, scenarios)
-    desks = {kind: JobQueue() for kind in ("scenario", "suite", "trials")}
     named = configurations(loaded)
-    about = msgspec.json.encode(page_description(work, named))
+    description = msgspec.json.encode(page_description(work, named))
+    base = settings_in_force(loaded)
 
-    async def tell(_request: web.Request) -> web.Response:
-        return web.Response(body=about, content_type="application/json")
+    def add_job(path: str, compute: Callable[[BenchSettings], Any]) -> None:
+        """A route that computes an answer from settings, with a queue of its own."""
+        queue = JobQueue()
 
-    async def ask(request: web.Request, answer: Callable[[BenchRequest], Any]) -> web.Response:
-        found = await json_body(request, BenchRequest)
-        check_settings(found.bench)
-        desk = desks[request.path.rsplit("/", 1)[-1]]
-        body = await desk.ask(found.client, lambda: msgspec.json.encode(answer(found)))
-        return web.Response(
-            body=body, content_type="application/json", headers={"Cache-Control": "no-store"}
-        )
+        async def run(request: web.Request) -> web.Response:
+            body = await json_body(request, BenchRequest)
+            check_settings(body.bench)
+            job = partial(_encoded, compute, body.bench)
+            return web.Response(
+                body=await queue.run(body.client, job), content_type="application/json"
+            )
 
-    async def scenario(request: web.Request) -> web.Response:
-        return await ask(request, lambda found: scenario_json(shown, found, named))
+        app.router.add_post(path, run)
 
-    async def suite(request: web.Request) -> web.Response:
-        return await ask(request, lambda found: comparison_json(work, found.bench, origin))
-
-    async def trials(request: web.Request) -> web.Response:
-        return await ask(
-            request,
-            lambda found: {"trials": trial_summaries(work.whole(found.bench), found.bench)},
-        )
+    async def about(_request: web.Request) -> web.Response:
+        return web.Response(body=description, content_type="application/json")
 
     async def read_scenario(request: web.Request) -> web.Response:
-        found = await json_body(request, TextRequest)
-        if len(found.text) > MAX_SCRIPT_CHARS:
-            raise web.HTTPRequestEntityTooLarge(MAX_SCRIPT_CHARS, len(found.text))
-        one = await asyncio.to_thread(parse_custom_scenario, found.text, found.name)
-        return json_answer({"script": script(one), "text": dump_scenario(one)})
+        body = await json_body(request, TextRequest)
+        if len(body.text) > MAX_SCRIPT_CHARS:
+            raise web.HTTPRequestEntityTooLarge(MAX_SCRIPT_CHARS, len(body.text))
+        scenario = await asyncio.to_thread(parse_custom_scenario, body.text, body.name)
+        return json_answer({"script": script(scenario), "text": dump_scenario(scenario)})
 
     async def read_challenge(request: web.Request) -> web.Response:
-        found = await json_body(request, TextRequest)
-        base = settings_in_force(loaded)
-        if found.text.lstrip().startswith("{"):
-            bench = settings_from_file(found.text, found.name)
+        body = await json_body(request, TextRequest)
+        if body.text.lstrip().startswith("{"):
+            bench = settings_from_file(body.text, body.name)
         else:
-            bench = settings_from_link(found.text, base)
+            bench = settings_from_link(body.text, base)
         return json_answer({"bench": bench, "link": settings_to_link(bench, base)})
 
     add_page(app, PAGE)
-    app.router.add_get("/testbench/about", tell)
-    app.router.add_post("/testbench/scenario", scenario)
-    app.router.add_post("/testbench/suite", suite)
-    app.router.add_post("/testbench/trials", trials)
+    app.router.add_get("/testbench/about", about)
+    add_job("/testbench/scenario", lambda bench: scenario_json(shown, bench, named))
+    add_job("/testbench/suite", lambda bench: comparison_json(work, bench, origin))
+    add_job("/testbench/trials", lambda bench: trials_json(work, bench))
     app.router.add_post("/testbench/read-scenario", read_scenario)
     app.router.add_post("/testbench/read-challenge", read_challenge)
 
 
+def _encoded(compute: Callable[[BenchSettings], Any], bench: BenchSettings) -> bytes:
+    return msgspec.json.encode(compute(bench))
+
+
 def configurations(loaded: LoadedConfig) -> dict[str, DecisionConfig]:
-    """The configuration in force, where it is none of the named, and those."""
+    """The named configurations, and the one in force where it is none of them."""
     if loaded.config.decision in CONFIGURATIONS.values():
         return dict(CONFIGURATIONS)
     return {"configured": loaded.config.decision, **CONFIGURATIONS}
 
 
 def scenario_json(
-    work: BenchRunner, asked: BenchRequest, named: dict[str, DecisionConfig]
+    work: BenchRunner, bench: BenchSettings, named: dict[str, DecisionConfig]
 ) -> dict[str, Any]:
-    """The playback of the scenario shown, for the bench's decision and those beside it."""
-    bench = asked.bench
+    """The playback of the scenario shown, under the bench's decision and those beside it."""
     suite = work.only(bench)
     name = next((n for n, d in named.items() if d == bench.decision), "bench")
     sides = {name: bench.decision}
@@ -156,6 +152,11 @@ def scenario_json(
         "link": settings_to_link(bench, settings_in_force(work.loaded)),
         "script": script(suite.scenarios[0]),
     }
+
+
+def trials_json(work: BenchRunner, bench: BenchSettings) -> dict[str, Any]:
+    """Means over the random trials of the suite; `trials` is null when nobody is missed."""
+    return {"trials": trial_summaries(work.whole(bench), bench)}
 
 
 def script(scenario: Scenario) -> dict[str, Any]:
@@ -183,7 +184,7 @@ def _size(size_m: tuple[float, float, float]) -> dict[str, float]:
 
 
 def page_description(work: BenchRunner, named: dict[str, DecisionConfig]) -> dict[str, Any]:
-    """What the page needs once: scenarios, configurations, ranges, and which code decides."""
+    """What the page loads once: scenarios, configurations, ranges and code hashes."""
     base = settings_in_force(work.loaded)
     suite: Suite = work.whole(base)
     return {
@@ -215,42 +216,38 @@ def page_description(work: BenchRunner, named: dict[str, DecisionConfig]) -> dic
 
 
 def ranges() -> dict[str, Any]:
-    """Every number's bounds and meaning, by key: what `BenchSettings` itself checks."""
-    schema = msgspec.json.schema(BenchSettings)["$defs"]
+    """Bounds and meaning of every setting by key, as `BenchSettings` checks them."""
     found: dict[str, Any] = {}
-    for section, name in (
-        ("camera", "Mount"),
-        ("decision", "DecisionConfig"),
-        ("perception", "Perception"),
-        ("delay", "Delay"),
-        ("danger", "GroundTruthThresholds"),
-    ):
-        for key, told in schema[name]["properties"].items():
-            found[f"{section}.{key}"] = {
-                "low": told.get("minimum", told.get("exclusiveMinimum")),
-                "high": told.get("maximum"),
-                "meaning": told.get("description", ""),
-                "whole": told.get("type") == "integer",
+    for section in msgspec.structs.fields(BenchSettings):
+        if not (isinstance(section.type, type) and issubclass(section.type, Section)):
+            continue
+        schema = msgspec.json.schema(section.type)["$defs"][section.type.__name__]
+        for key, value in schema["properties"].items():
+            found[f"{section.name}.{key}"] = {
+                "low": value.get("minimum", value.get("exclusiveMinimum")),
+                "high": value.get("maximum"),
+                "meaning": value.get("description", ""),
+                "whole": value.get("type") == "integer",
             }
     return found
 
 
 class JobQueue:
-    """One job at a time, in a thread; of each client's waiting jobs only the newest is done."""
+    """Runs one job at a time, in a thread; of each client's waiting jobs only the newest."""
 
     def __init__(self, most_waiting: int = _MOST_WAITING) -> None:
         self._most = most_waiting
         self._waiting: OrderedDict[str, asyncio.Future[bool]] = OrderedDict()
         self._busy = False
 
-    async def ask(self, client: str, job: Callable[[], T]) -> T:
-        """The job's answer. HTTPConflict when a newer one of this client has come meanwhile,
-        HTTPServiceUnavailable when too many wait."""
+    async def run(self, client: str, job: Callable[[], T]) -> T:
+        """The job's result. HTTPConflict when a newer job of this client replaced it,
+        HTTPServiceUnavailable when too many jobs wait."""
         if self._busy:
             await self._wait(client)
         self._busy = True
         task = asyncio.ensure_future(asyncio.to_thread(job))
-        # A client that goes away must not let a second job begin beside the running one.
+        # Shielded: when a client disconnects, the next job still waits for the running one.
         task.add_done_callback(lambda _: self._next())
         return await asyncio.shield(task)
 
@@ -269,7 +266,7 @@ class JobQueue:
             mine = await turn
         except asyncio.CancelledError:
             if turn.done() and not turn.cancelled() and turn.result():
-                self._next()  # the turn came as the client left: somebody else's, then
+                self._next()  # the client left as its turn came: pass it on
             elif self._waiting.get(client) is turn:
                 del self._waiting[client]
             raise
@@ -281,6 +278,6 @@ class JobQueue:
         while self._waiting:
             _, turn = self._waiting.popitem(last=False)
             if not turn.done():
-                self._busy = True  # kept for the one whose turn it is
+                self._busy = True  # reserved for this job
                 turn.set_result(True)
                 return

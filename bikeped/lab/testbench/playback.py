@@ -19,7 +19,7 @@ from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.simulation.metrics import finite_or_none, measure
 from bikeped.lab.simulation.simulate import FPS, verdicts
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruth
-from bikeped.lab.testbench.run import BenchSuite
+from bikeped.lab.testbench.runner import BenchSuite
 from bikeped.types import BoolArray, FloatArray, Kind, State
 
 #: Codes of the truth's tiers in `truth.tier`.

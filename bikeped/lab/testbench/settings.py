@@ -247,7 +247,7 @@ def parse_custom_scenario(text: str, source: str) -> Scenario:
 def settings_to_link(bench: BenchSettings, base: BenchSettings) -> str:
     """What differs from `base` as `key=value&...`, readable: `decision.d_max_m=15`."""
     return "&".join(
-        f"{key}={quote(_text(value), safe='')}" for key, value in _differences(bench, base)
+        f"{key}={quote(_text(value), safe='')}" for key, _, value in differing_keys(bench, base)
     )
 
 
@@ -255,18 +255,20 @@ def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 
-#: What says only how it is looked at, and changes no figure of the suite.
-VIEW = ("scenario", "beside")
+#: Keys that choose what the page shows, and change no figure of the suite.
+VIEW_KEYS = ("scenario", "beside")
 
 
-def _differences(bench: BenchSettings, base: BenchSettings) -> list[tuple[str, Any]]:
+def differing_keys(bench: BenchSettings, base: BenchSettings) -> list[tuple[str, Any, Any]]:
+    """[(key, value in `base`, value in `bench`), ...] where they differ, as `decision.d_max_m`."""
     now, before = msgspec.to_builtins(bench), msgspec.to_builtins(base)
-    found: list[tuple[str, Any]] = []
+    found: list[tuple[str, Any, Any]] = []
     for key, value in now.items():
-        if isinstance(value, dict) and isinstance(before[key], dict):
-            found += [(f"{key}.{k}", v) for k, v in value.items() if v != before[key][k]]
-        elif value != before[key]:
-            found.append((key, value))
+        old = before[key]
+        if isinstance(value, dict) and isinstance(old, dict):
+            found += [(f"{key}.{k}", old[k], v) for k, v in value.items() if v != old[k]]
+        elif value != old:
+            found.append((key, old, value))
     return found
 
 

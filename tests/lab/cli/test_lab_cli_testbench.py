@@ -15,7 +15,7 @@ from aiohttp.test_utils import TestClient, TestServer
 from bikeped.cli.main import main
 from bikeped.config import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
-from bikeped.lab.testbench.contest import InvocationOptions
+from bikeped.lab.testbench.comparison import InvocationOptions
 from bikeped.lab.testbench.pages import add_testbench
 from bikeped.lab.testbench.settings import settings_in_force
 from bikeped.web.security import AccessPolicy
@@ -123,7 +123,7 @@ def test_a_challenge_gives_the_page_s_numbers_on_the_command_line(name, folder, 
         (["contest", "decision.d_max_m=-3"], "d_max_m"),
         (["contest", "#decision.nothing=1"], "no such setting"),
         (["export", "nowhere/report.html"], "nowhere/report.html"),
-        (["--port", "1", "export", "x.html"], "behind the command"),
+        (["--port", "1", "export", "x.html"], "after the subcommand"),
     ],
 )
 def test_bad_input_is_one_line(words, says, capsys, tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from bikeped.lab.experiments.trials import (
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.lab.testbench.playback import TESTS, coverage, playback
-from bikeped.lab.testbench.run import BenchRunner, trial_summaries
+from bikeped.lab.testbench.runner import BenchRunner, trial_summaries
 from bikeped.lab.testbench.settings import Pose
 from bikeped.types import State
 
@@ -130,7 +130,7 @@ def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
     one = work.only(bench(name))
     play = playback(one, 0, {rule: decision})
     side = play["sides"][0]
-    decider, rows = Decider(rule_settings(decision)), one.run.rows
+    decider, rows = Decider(rule_settings(decision)), one.rule_input.rows
     for frame in range(play["frames"]):
         at = rows.frame == frame
         told = decider.decide(frame / 30, rows.id[at], rows.kind[at], rows.xy_m[at])

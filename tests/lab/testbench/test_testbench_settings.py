@@ -207,7 +207,7 @@ async def test_too_much_work_is_refused():
 
 
 async def test_of_a_page_s_waiting_requests_only_the_newest_is_answered():
-    desk, gate, order = JobQueue(), threading.Event(), []
+    queue, gate, order = JobQueue(), threading.Event(), []
 
     def job(name):
         def run():
@@ -217,29 +217,29 @@ async def test_of_a_page_s_waiting_requests_only_the_newest_is_answered():
 
         return run
 
-    first = asyncio.ensure_future(desk.ask("me", job("first")))
+    first = asyncio.ensure_future(queue.run("me", job("first")))
     await asyncio.sleep(0)
-    old = asyncio.ensure_future(desk.ask("me", job("old")))
+    old = asyncio.ensure_future(queue.run("me", job("old")))
     await asyncio.sleep(0)
-    other = asyncio.ensure_future(desk.ask("you", job("other")))
+    other = asyncio.ensure_future(queue.run("you", job("other")))
     await asyncio.sleep(0)
-    new = asyncio.ensure_future(desk.ask("me", job("new")))
+    new = asyncio.ensure_future(queue.run("me", job("new")))
     with pytest.raises(web.HTTPConflict):
         await old
     gate.set()
     assert await asyncio.gather(first, other, new) == ["first", "other", "new"]
     assert order == ["first", "other", "new"]
-    assert await desk.ask("me", job("later")) == "later"
+    assert await queue.run("me", job("later")) == "later"
 
 
-async def test_a_full_desk_turns_away_and_a_left_one_goes_on():
-    desk, gate = JobQueue(most_waiting=2), threading.Event()
-    running = asyncio.ensure_future(desk.ask("0", lambda: gate.wait(30)))
+async def test_a_full_queue_turns_away_and_goes_on_when_a_client_left():
+    queue, gate = JobQueue(most_waiting=2), threading.Event()
+    running = asyncio.ensure_future(queue.run("0", lambda: gate.wait(30)))
     await asyncio.sleep(0)
-    waiting = [asyncio.ensure_future(desk.ask(str(i), lambda i=i: i)) for i in (1, 2)]
+    waiting = [asyncio.ensure_future(queue.run(str(i), lambda i=i: i)) for i in (1, 2)]
     await asyncio.sleep(0)
     with pytest.raises(web.HTTPServiceUnavailable):
-        await desk.ask("3", lambda: 3)
+        await queue.run("3", lambda: 3)
     waiting[0].cancel()
     with pytest.raises(asyncio.CancelledError):
         await waiting[0]
@@ -248,8 +248,8 @@ async def test_a_full_desk_turns_away_and_a_left_one_goes_on():
     assert await waiting[1] == 2
 
 
-async def test_an_error_in_a_job_does_not_block_the_desk():
-    desk = JobQueue()
+async def test_an_error_in_a_job_does_not_block_the_queue():
+    queue = JobQueue()
     with pytest.raises(ZeroDivisionError):
-        await desk.ask("me", lambda: 1 // 0)
-    assert await desk.ask("me", lambda: 7) == 7
+        await queue.run("me", lambda: 1 // 0)
+    assert await queue.run("me", lambda: 7) == 7
