@@ -34,6 +34,7 @@ class Effect(enum.Enum):
 class Severity(enum.IntEnum):
     """How a fault is logged; the values are those of `logging`."""
 
+    INFO = logging.INFO  #: part of every start and recovery
     WARNING = logging.WARNING  #: the crossing is still watched and warned
     ERROR = logging.ERROR  #: the crossing is not warned, or not fully
     CRITICAL = logging.CRITICAL  #: this process cannot recover
@@ -60,9 +61,11 @@ class FaultKind:
     exit_status: int | None = None  #: of the process, where the fault ends it
 
 
-def _stops(code: str, component: Component, meaning: str) -> FaultKind:
+def _stops(
+    code: str, component: Component, meaning: str, severity: Severity = Severity.ERROR
+) -> FaultKind:
     """The light shows FAULT until good frames come again."""
-    return FaultKind(code, component, Effect.FAULT, Severity.ERROR, Clears.GOOD_FRAMES, meaning)
+    return FaultKind(code, component, Effect.FAULT, severity, Clears.GOOD_FRAMES, meaning)
 
 
 def _ends(code: str, component: Component, meaning: str) -> FaultKind:
@@ -91,8 +94,18 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _stops("detector.error", "detector", "The detector fails on every frame."),
         _ends("detector.hang", "detector", "Inference has not returned for camera.hang_after_s."),
         _ends("detector.failing", "detector", "Only failures for camera.hang_after_s."),
-        _stops("service.starting", "service", "The model loads, or the first frames are due."),
-        _stops("service.recovering", "service", "A fault is over; good frames are counted."),
+        _stops(
+            "service.starting",
+            "service",
+            "The model loads, or the first frames are due.",
+            Severity.INFO,
+        ),
+        _stops(
+            "service.recovering",
+            "service",
+            "A fault is over; good frames are counted.",
+            Severity.INFO,
+        ),
         FaultKind(
             "light.not_refreshed",
             "light",

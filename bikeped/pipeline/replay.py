@@ -15,14 +15,13 @@ from typing import Any
 from bikeped.capture import FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
-from bikeped.feedback import LightDriver, SignalLogic, SimulatedLight
+from bikeped.feedback import LightDriver, SimulatedLight
 from bikeped.overlay import VideoWriter
-from bikeped.pipeline.detection_stage import DetectionStage, DetectorPool, FrameDetector
-from bikeped.pipeline.factory import header_of, load_detector_pool, start_publisher
+from bikeped.pipeline.application import Application, load_detector_pool, new_event_header
+from bikeped.pipeline.detection_stage import FrameDetector
 from bikeped.pipeline.feed import RecordedFeed
 from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.ground_mapper import GroundMapper
-from bikeped.pipeline.health_report import report_health
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.replay_outputs import (
     OVERLAY_SIZE,
@@ -31,18 +30,14 @@ from bikeped.pipeline.replay_outputs import (
     Progress,
     ReplaySummary,
 )
-from bikeped.pipeline.signal_dispatcher import SignalDispatcher
-from bikeped.pipeline.telemetry import Telemetry
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.pipeline.web_context import Pages, WebContext, open_pages
-from bikeped.telemetry.builders import HealthMessage
+from bikeped.pipeline.web_context import Pages
 from bikeped.telemetry.latency import StageTimes
-from bikeped.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
 #: The percentiles of a replay are those of all its frames, up to this many (nearly an hour).
-REMEMBER = 100_000
+LATENCY_FRAMES = 100_000
 #: So many detections tell whether the camera settings fit the recording.
 ENOUGH_DETECTIONS = 20
 
@@ -162,77 +157,52 @@ async def _replay(
     pages: Pages | None,
     serving: Callable[[str], None] | None,
 ) -> ReplayResult:
-    config = loaded.config
     summary = ReplaySummary()
     async with contextlib.AsyncExitStack() as stack:
-        publisher = start_publisher(loaded, stack) if mqtt else None
-        metrics = Metrics() if pages is not None else None
-        telemetry = Telemetry(
-            loaded, track_and_decide, publisher=publisher, metrics=metrics, remember=REMEMBER
-        )
-        watchers = [] if pages is None else [pages]
-        outputs = [summary, telemetry, *outputs, *watchers]
+        outputs = [summary, *outputs]
         if files.events is not None:
-            outputs.append(
-                stack.enter_context(EventFile(files.events, header_of(loaded, detector)))
-            )
+            header = new_event_header(loaded, detector)
+            outputs.append(stack.enter_context(EventFile(files.events, header)))
         if files.overlay is not None:
             fps = source.fps if source.fps > 0 else 30.0
-            overlay = OverlayVideo(
-                stack.enter_context(VideoWriter(files.overlay, fps, OVERLAY_SIZE)), track_and_decide
-            )
+            writer = stack.enter_context(VideoWriter(files.overlay, fps, OVERLAY_SIZE))
+            overlay = OverlayVideo(writer, track_and_decide)
             outputs.append(overlay)
             stack.push_async_callback(overlay.wait)
-        # A recording at a desk must not move the lamps of a crossing.
-        # Nor is a slow desk a stuck service: the deadman has an hour's patience.
-        light = LightDriver(
-            SimulatedLight, fault_blink_hz=config.feedback.fault_blink_hz, deadman_s=3600.0
-        )
+        # A replay must not switch the lamps of a crossing. It may run slower than real time, so its
+        # light has a watchdog of an hour.
+        blink_hz = loaded.config.feedback.fault_blink_hz
+        light = LightDriver(SimulatedLight, fault_blink_hz=blink_hz, deadman_s=3600.0)
         light.start()
         stack.push_async_callback(asyncio.to_thread, light.close)
-        loop = Loop(
+        application = Application(
+            loaded,
+            detector,
+            track_and_decide,
+            stack,
             feed=RecordedFeed(source),
-            detection=DetectionStage(detector, OVERLAY_SIZE[0] if files.overlay is not None else 0),
-            track_and_decide=track_and_decide,
-            dispatcher=SignalDispatcher(
-                SignalLogic.from_config(config.feedback), light, listeners=(telemetry, *watchers)
-            ),
+            source=source.name,
+            light=light,
+            light_name="simulated",
+            mqtt=mqtt,
+            pages=pages,
             outputs=outputs,
-            max_inflight=detector.max_inflight if isinstance(detector, DetectorPool) else 1,
+            view_width=OVERLAY_SIZE[0] if files.overlay is not None else 0,
+            latency_frames=LATENCY_FRAMES,
         )
-
-        def health() -> HealthMessage:
-            return telemetry.health(loop, "simulated")
-
-        if pages is not None and metrics is not None:
-            web_context = WebContext(
-                loaded=loaded,
-                track_and_decide=track_and_decide,
-                source=source.name,
-                detector=detector.name,
-                health=health,
-                metrics=metrics.registry,
-                mqtt=None if publisher is None else lambda: publisher.status,
-            )
-            server = await open_pages(pages, web_context, config.web, stack)
-            if server.error is not None:
-                raise BikepedError(server.error)
-            if serving is not None:
-                serving(str(server.address))
-        telling = asyncio.create_task(
-            report_health(telemetry, loop, health, config.mqtt.health_interval_s)
-        )
-        # Only now, when nothing more can be refused: an error is one line on its own.
+        server = await application.serve_pages()
+        if server is not None and server.error is not None:
+            raise BikepedError(server.error)
+        if server is not None and serving is not None:
+            serving(str(server.address))
+        # Logged only now, when nothing can be refused any more: an error is one line on its own.
         for text in warnings:
             log.warning("%s", text)
+        loop = application.loop
         began = time.perf_counter()
-        try:
-            with _stop_on_signals(loop):
-                await loop.run()
-        finally:
-            telling.cancel()
+        with _stop_on_signals(loop):
+            await application.run()
         wall_s = time.perf_counter() - began
-        telemetry.publish_health(health())
         if loop.counts.frames == 0:
             raise BikepedError(
                 f"{source.name}: no frame could be read ({loop.counts.undecodable} did not "
@@ -241,7 +211,7 @@ async def _replay(
     warnings.extend(_ground_warnings(loaded, summary))
     return ReplayResult(
         summary=summary,
-        times=telemetry.times,
+        times=application.telemetry.times,
         frames=loop.counts.frames,
         undecodable=loop.counts.undecodable,
         wall_s=wall_s,

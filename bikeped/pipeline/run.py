@@ -16,24 +16,20 @@ from bikeped.capture import FrameGrabber, FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
-from bikeped.feedback import LightDriver, SignalLogic, fault_signal, light_driver, open_speaker
+from bikeped.feedback import LightDriver, fault_signal, light_driver, open_speaker
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
-from bikeped.pipeline.detection_stage import DetectionStage, FrameDetector
-from bikeped.pipeline.factory import header_of, load_detector_pool, start_publisher
+from bikeped.pipeline.application import Application, load_detector_pool, new_event_header
+from bikeped.pipeline.detection_stage import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.ground_mapper import GroundMapper
-from bikeped.pipeline.health_report import report_health
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.systemd import Notifier
-from bikeped.pipeline.telemetry import Telemetry
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.pipeline.web_context import Pages, WebContext, open_pages
+from bikeped.pipeline.web_context import Pages
 from bikeped.pipeline.worker_threads import WorkerThread
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.builders import HealthMessage
-from bikeped.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -108,81 +104,52 @@ async def _serve(
     last: contextlib.AsyncExitStack,
     pages: Pages | None,
 ) -> int:
-    """Starts every part, watches until `stop`; what `stack` unwinds comes before `last`."""
+    """Starts every part and runs until `stop`; `stack` unwinds before `last`."""
     config, camera = loaded.config, loaded.config.camera
     speaker = open_speaker(config.feedback, loaded.base_dir)
     stack.push_async_callback(speaker.close)
-    publisher = start_publisher(loaded, stack) if config.mqtt.enabled else None
     audit = None
     if config.audit.path is not None:
-        audit = AuditLog(config.audit, header_of(loaded, detector), base_dir=loaded.base_dir)
+        header = new_event_header(loaded, detector)
+        audit = AuditLog(config.audit, header, base_dir=loaded.base_dir)
         audit.start()
         stack.push_async_callback(asyncio.to_thread, audit.close)
-    metrics = Metrics() if pages is not None else None
-    watchers = () if pages is None else (pages,)
-    telemetry = Telemetry(
-        loaded, track_and_decide, publisher=publisher, audit=audit, metrics=metrics
-    )
-    dispatcher = SignalDispatcher(
-        SignalLogic.from_config(config.feedback), light, speaker, listeners=(telemetry, *watchers)
-    )
     grabber = FrameGrabber(partial(_open_camera, loaded), stale_after_s=camera.stale_after_s)
-    grabber.start()
-    loop = Loop(
+    application = Application(
+        loaded,
+        detector,
+        track_and_decide,
+        stack,
         feed=LiveFeed(grabber),
-        detection=DetectionStage(detector),
-        track_and_decide=track_and_decide,
-        dispatcher=dispatcher,
-        outputs=(telemetry, *watchers),
+        source=camera.source,
+        light=light,
+        light_name=config.feedback.light,
+        mqtt=config.mqtt.enabled,
+        pages=pages,
+        speaker=speaker,
+        audit=audit,
         limits=Limits(
             stale_after_s=camera.stale_after_s,
             silent_after_s=config.detection.silent_after_s,
             hang_after_s=camera.hang_after_s,
         ),
         on_tick=notifier.alive,
-        fault_sources=(
-            lambda: speaker.fault,
-            lambda: _audit_fault(audit),
-            lambda: light.fault,
-        ),
     )
-
-    def health() -> HealthMessage:
-        return telemetry.health(loop, config.feedback.light)
-
-    if pages is not None and metrics is not None:
-        web_context = WebContext(
-            loaded=loaded,
-            track_and_decide=track_and_decide,
-            source=camera.source,
-            detector=detector.name,
-            health=health,
-            metrics=metrics.registry,
-            mqtt=None if publisher is None else lambda: publisher.status,
-        )
-        await open_pages(pages, web_context, config.web, stack)
-    tasks = (
-        asyncio.create_task(_stop_when(stop, loop)),
-        asyncio.create_task(
-            report_health(
-                telemetry, loop, health, config.mqtt.health_interval_s, lambda: light.errors
-            )
-        ),
-    )
+    grabber.start()
+    await application.serve_pages()
+    stopping = asyncio.create_task(_stop_when(stop, application.loop))
     notifier.ready(f"watching {camera.source}")
     try:
-        await loop.run()
+        await application.run()
     except StageHangError as hang:
         log.critical("%s; ending so that a fresh process can start", hang)
         return hang.fault.kind.exit_status or 0
     finally:
         notifier.stopping()
-        for task in tasks:
-            task.cancel()
+        stopping.cancel()
         # Stopping the rest may take seconds, in which the light must not look unattended.
-        last.callback(asyncio.create_task(_refresh(dispatcher)).cancel)
-        telemetry.publish_health(health())
-        log.info("latency\n%s", telemetry.times.table())
+        last.callback(asyncio.create_task(_refresh(application.dispatcher)).cancel)
+        log.info("latency\n%s", application.telemetry.times.table())
     return 0
 
 
@@ -243,9 +210,3 @@ async def _darken(light: LightDriver) -> None:
         log.info("stopped: the light is off")
     else:
         log.error("stopped, but the light does not answer and may still be on")
-
-
-def _audit_fault(audit: AuditLog | None) -> Fault | None:
-    if audit is None or audit.fault is None:
-        return None
-    return Fault("audit", "audit.error", audit.fault)

@@ -1,8 +1,7 @@
-"""The seam to the pages: the service shows them what it does, and knows nothing of them."""
+"""What the pipeline gives the web pages, and what it expects of them."""
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,18 +9,17 @@ from typing import Protocol
 from aiohttp import web
 from prometheus_client import CollectorRegistry
 
-from bikeped.config import LoadedConfig, WebConfig
+from bikeped.config import LoadedConfig
 from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.signal_dispatcher import SignalListener
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.builders import HealthMessage
-from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.mqtt import MqttStatus
 
 
 @dataclass(frozen=True)
 class WebContext:
-    """What pages may look at. Nothing here changes what the service does."""
+    """What pages may read. Nothing here changes what the service does."""
 
     loaded: LoadedConfig
     track_and_decide: TrackAndDecide
@@ -33,17 +31,7 @@ class WebContext:
 
 
 class Pages(FrameResultListener, SignalListener, Protocol):
-    """Pages hear every result and every signal, put them aside, and return at once."""
+    """Pages take every result and every signal, queue them, and return at once."""
 
     def application(self, web_context: WebContext) -> web.Application:
-        """What is served, the monitoring included."""
-
-
-async def open_pages(
-    pages: Pages, web_context: WebContext, config: WebConfig, stack: contextlib.AsyncExitStack
-) -> HttpServer:
-    """Serves the pages until `stack` unwinds. A port that cannot be bound is in `error`."""
-    server = HttpServer(pages.application(web_context), config)
-    await server.start()
-    stack.push_async_callback(server.stop)
-    return server
+        """The web application, with the monitoring endpoints."""

@@ -16,8 +16,8 @@ from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
+from bikeped.pipeline.application import load_detector_pool
 from bikeped.pipeline.detection_stage import DetectionStage, FrameDetector
-from bikeped.pipeline.factory import load_detector_pool
 from bikeped.pipeline.feed import RecordedFeed
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.loop import Loop

@@ -1,0 +1,186 @@
+"""What `run` and `replay` share: the detector, and the loop with telemetry and pages around it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+
+import msgspec
+
+from bikeped import __version__
+from bikeped.config import LoadedConfig, road_region
+from bikeped.cores import cores
+from bikeped.detection.load import load_detector
+from bikeped.errors import DetectorError
+from bikeped.faults import Fault
+from bikeped.feedback import LightDriver, SignalLogic, Speaker
+from bikeped.pipeline.detection_stage import (
+    MAX_INFLIGHT,
+    DetectionStage,
+    DetectorPool,
+    FrameDetector,
+)
+from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, Limits
+from bikeped.pipeline.feed import Feed
+from bikeped.pipeline.frame_result import FrameResultListener
+from bikeped.pipeline.health_report import report_health
+from bikeped.pipeline.loop import Loop
+from bikeped.pipeline.signal_dispatcher import SignalDispatcher
+from bikeped.pipeline.telemetry import Telemetry
+from bikeped.pipeline.track_and_decide import TrackAndDecide
+from bikeped.pipeline.web_context import Pages, WebContext
+from bikeped.telemetry.audit import AuditLog
+from bikeped.telemetry.builders import EventHeader, HealthMessage, event_header
+from bikeped.telemetry.http_server import HttpServer
+from bikeped.telemetry.metrics import Metrics
+from bikeped.telemetry.mqtt import MqttPublisher
+
+
+def load_detector_pool(loaded: LoadedConfig, *, recorded: bool = False) -> DetectorPool:
+    """The configured model; DetectorError names the key and the remedy.
+
+    `recorded`: for a recording, where throughput counts and not the delay of one frame. On a
+    processor whose threads the configuration leaves open, two copies with half of the cores each
+    then detect two frames: the threads of one inference wait for one another at every layer.
+    """
+    detection, base = loaded.config.detection, loaded.base_dir
+    if detection.model is None:
+        raise DetectorError(
+            f"{loaded.source}: detection.model: no model is configured; name an .onnx or .engine "
+            "file there, or with --set detection.model=FILE"
+        )
+    road = road_region(loaded)
+    threads = cores() // MAX_INFLIGHT
+    engine = detection.model.lower().endswith(".engine")
+    if recorded and threads and detection.threads == 0 and not engine:
+        from bikeped.detection.onnx_runtime import runs_on_cpu
+
+        if runs_on_cpu(detection.providers):
+            shared = msgspec.structs.replace(detection, threads=threads)
+            return DetectorPool(*(load_detector(shared, base, road) for _ in range(MAX_INFLIGHT)))
+    return DetectorPool(load_detector(detection, base, road))
+
+
+def new_event_header(loaded: LoadedConfig, detector: FrameDetector) -> EventHeader:
+    """The header of an event file or audit log that starts now."""
+    return event_header(
+        config_hash=loaded.hash,
+        calibration_hash=loaded.calibration_hash,
+        model_hash=detector.model_hash,
+        version=__version__,
+        started_unix_s=time.time(),
+    )
+
+
+class Application:
+    """The loop from `feed` to `light`, with the parts that the configuration asks for.
+
+    `source` names the camera or the recording, `light_name` the kind of light. What is started is
+    stopped when `stack` unwinds. `outputs` take every frame result after telemetry; `view_width`:
+    pixels that their pictures need; `latency_frames`: over how many frames percentiles are taken.
+    Raises TelemetryError for MQTT settings that cannot work.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedConfig,
+        detector: FrameDetector,
+        track_and_decide: TrackAndDecide,
+        stack: contextlib.AsyncExitStack,
+        *,
+        feed: Feed,
+        source: str,
+        light: LightDriver,
+        light_name: str,
+        mqtt: bool,
+        pages: Pages | None = None,
+        speaker: Speaker | None = None,
+        audit: AuditLog | None = None,
+        outputs: Sequence[FrameResultListener] = (),
+        view_width: int = 0,
+        limits: Limits = DEFAULT_LIMITS,
+        on_tick: Callable[[], None] = lambda: None,
+        latency_frames: int = 900,
+    ) -> None:
+        self._loaded, self._detector, self._stack = loaded, detector, stack
+        self._track_and_decide, self._source = track_and_decide, source
+        self._light, self._light_name = light, light_name
+        self._pages, self._metrics = pages, Metrics() if pages is not None else None
+        self._publisher: MqttPublisher | None = None
+        if mqtt:
+            self._publisher = MqttPublisher(loaded.config.mqtt, base_dir=loaded.base_dir)
+            self._publisher.start()
+            stack.push_async_callback(asyncio.to_thread, self._publisher.stop)
+        self.telemetry = Telemetry(
+            loaded,
+            track_and_decide,
+            publisher=self._publisher,
+            audit=audit,
+            metrics=self._metrics,
+            remember=latency_frames,
+        )
+        watchers = () if pages is None else (pages,)
+        self.dispatcher = SignalDispatcher(
+            SignalLogic.from_config(loaded.config.feedback),
+            light,
+            speaker,
+            listeners=(self.telemetry, *watchers),
+        )
+        self.loop = Loop(
+            feed=feed,
+            detection=DetectionStage(detector, view_width),
+            track_and_decide=track_and_decide,
+            dispatcher=self.dispatcher,
+            outputs=(self.telemetry, *watchers, *outputs),
+            limits=limits,
+            on_tick=on_tick,
+            max_inflight=detector.max_inflight if isinstance(detector, DetectorPool) else 1,
+            fault_sources=(
+                lambda: None if speaker is None else speaker.fault,
+                lambda: _audit_fault(audit),
+                lambda: light.fault,
+            ),
+        )
+
+    async def serve_pages(self) -> HttpServer | None:
+        """Serves the pages, if there are any. A port that cannot be bound is in `error`."""
+        if self._pages is None or self._metrics is None:
+            return None
+        publisher = self._publisher
+        context = WebContext(
+            loaded=self._loaded,
+            track_and_decide=self._track_and_decide,
+            source=self._source,
+            detector=self._detector.name,
+            health=self._health,
+            metrics=self._metrics.registry,
+            mqtt=None if publisher is None else lambda: publisher.status,
+        )
+        server = HttpServer(self._pages.application(context), self._loaded.config.web)
+        await server.start()
+        self._stack.push_async_callback(server.stop)
+        return server
+
+    async def run(self) -> None:
+        """Runs the loop (see `Loop.run`), reporting health meanwhile and once at the end."""
+        interval_s = self._loaded.config.mqtt.health_interval_s
+        reporting = asyncio.create_task(
+            report_health(
+                self.telemetry, self.loop, self._health, interval_s, lambda: self._light.errors
+            )
+        )
+        try:
+            await self.loop.run()
+        finally:
+            reporting.cancel()
+            self.telemetry.publish_health(self._health())
+
+    def _health(self) -> HealthMessage:
+        return self.telemetry.health(self.loop, self._light_name)
+
+
+def _audit_fault(audit: AuditLog | None) -> Fault | None:
+    detail = None if audit is None else audit.fault
+    return None if detail is None else Fault("audit", "audit.error", detail)
