@@ -11,7 +11,7 @@ values and from a grid of pitches, so a wrong start does not matter. Pure.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -274,16 +274,19 @@ class _Problem:
         return replace(alignment, **to)
 
     def jacobian(self, alignment: Alignment) -> FloatArray | None:
-        """Derivative [m, p] of the readings by the scaled free parameters; central differences."""
+        """Derivative [m, p] of the readings by the scaled free parameters."""
+        return self._derivatives(alignment, lambda a: (self.predict(a) or (None,))[0], 1e-4)
+
+    def _derivatives(
+        self, at: Alignment, value: Callable[[Alignment], FloatArray | None], step: float
+    ) -> FloatArray | None:
+        """Central differences [k, p] of `value` [k] by the scaled free parameters."""
         columns = []
-        for k in range(len(self.free)):
-            step = np.zeros(len(self.free))
-            step[k] = 1e-4
-            up = self.predict(self.stepped(alignment, step))
-            down = self.predict(self.stepped(alignment, -step))
+        for steps in step * np.eye(len(self.free)):
+            up, down = value(self.stepped(at, steps)), value(self.stepped(at, -steps))
             if up is None or down is None:
                 return None
-            columns.append((up[0] - down[0]) / 2e-4)
+            columns.append((up - down) / (2 * step))
         return np.stack(columns, axis=1)
 
     def covariance(self, best: Alignment, cost: float) -> FloatArray:
@@ -366,15 +369,15 @@ class _Problem:
         pixel = pixel_at_distance(best.camera(self.like))
         if pixel is None:
             return None
-        slope = np.zeros(len(self.free))
-        for k, name in enumerate(self.free):
-            step = np.zeros(len(self.free))
-            step[k] = 1e-3
-            up = ground_distance_m(self.stepped(best, step).camera(self.like), pixel)
-            down = ground_distance_m(self.stepped(best, -step).camera(self.like), pixel)
-            if up is None or down is None:
-                return None
-            slope[k] = (up - down) / 2e-3 / best.scale(name)
+
+        def reading(alignment: Alignment) -> FloatArray | None:
+            distance_m = ground_distance_m(alignment.camera(self.like), pixel)
+            return None if distance_m is None else np.array([distance_m])
+
+        slope = self._derivatives(best, reading, 1e-3)
+        if slope is None:
+            return None
+        slope = slope[0] / np.array([best.scale(name) for name in self.free])
         return float(np.sqrt(slope @ covariance @ slope))
 
 

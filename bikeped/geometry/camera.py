@@ -1,4 +1,4 @@
-"""A fisheye camera above flat ground: world to pixel and pixel to ground.
+"""A fisheye camera above flat ground: ground to pixel and pixel to ground.
 
 Equations 1 to 5 of the paper. Camera axes and ground axes are both x forward, y right, z up; the
 camera ground frame has its origin on the ground below the lens.
@@ -49,13 +49,12 @@ class GroundCamera:
         object.__setattr__(self, "_to_ground", turn @ tilt)
 
     def rays(self, uv_px: npt.ArrayLike) -> FloatArray:
-        """Unit directions [n, 3] in ground axes of crop pixels [n, 2]; NaN outside the circle."""
+        """Unit rays [..., 3] in ground axes of crop pixels [..., 2]; NaN outside the circle."""
         uv = np.asarray(uv_px, dtype=np.float64)
         du, dv = uv[..., 0] - self.cx, uv[..., 1] - self.cy
         radius = np.hypot(du, dv)
         theta = self.lens.theta(radius)
-        # sin(theta)/r instead of sin and cos of the azimuth: one division, no branch at r = 0
-        # but the guarded one, and exact along the axes.
+        # sin(theta)/r instead of sin and cos of the azimuth: one division, exact along the axes.
         scale = np.sin(theta) / np.where(radius > 0, radius, 1.0)
         ray = np.stack([np.cos(theta), scale * du, -scale * dv], axis=-1)
         return ray @ self._to_ground.T
@@ -71,10 +70,10 @@ class GroundCamera:
         return ray[..., :2] * reach[..., None], down
 
     def project(self, xyz_m: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """Crop pixels [n, 2] of points [n, 3] (or [n, 2], on the ground), and which are seen [n].
+        """Crop pixels [n, 2] of points [n, 3] (or [n, 2], on the ground) in metres, and which are
+        visible [n]: within the field of view, in front of the lens plane, and on the sensor.
 
-        Seen means: less than half the field of view from the axis, in front of the lens plane, and
-        on the sensor. Pixels of unseen points are given where the lens model has them.
+        Other points have the pixel of the lens model where it has one.
         """
         point = np.asarray(xyz_m, dtype=np.float64)
         if point.shape[-1] == 2:
@@ -95,7 +94,7 @@ class GroundCamera:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where a camera stands in the world (x east, y north, metres) and where it looks.
+    """Position (x east, y north, metres) and heading of a camera in the world.
 
     `heading_deg` is counted from east, counter-clockwise: 90 looks north (+y).
     """

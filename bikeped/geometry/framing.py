@@ -13,7 +13,7 @@ from bikeped.types import FloatArray
 
 @dataclass(frozen=True)
 class Framing:
-    """How a frame of `frame_w` x `frame_h` lies in the crop that the calibration speaks of.
+    """Position of a frame in the crop whose pixels the calibration uses.
 
     The sensor image (`sensor_w` x `sensor_h`) is centred in a black square of side `pad_size`,
     whose middle square of side `crop_size` is the crop. None leaves a step out. A frame may be a
@@ -72,7 +72,7 @@ class Framing:
     def for_frame(self, frame_w: int, frame_h: int) -> Framing:
         """The framing of frames of this size, scaled copies of the sensor image.
 
-        Raises GeometryError when the proportions differ: such a frame is another camera's.
+        Raises GeometryError when the proportions differ: the frame is from another camera.
         """
         scale = self.sensor_w / frame_w
         if abs(frame_h * scale - self.sensor_h) > scale + 1e-9:
@@ -90,7 +90,5 @@ class Framing:
 
     def crop_to_frame(self, uv_px: npt.ArrayLike) -> FloatArray:
         """Crop pixels [..., 2] in the frame."""
-        uv: FloatArray = np.asarray(uv_px, dtype=np.float64) - np.asarray(
-            self.offset_px, dtype=np.float64
-        )
+        uv: FloatArray = np.asarray(uv_px, np.float64) - np.asarray(self.offset_px, np.float64)
         return uv / self.scale

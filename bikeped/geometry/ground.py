@@ -1,11 +1,11 @@
-"""The ground table: every crop pixel's direction, computed once, read by bilinear interpolation.
+"""The ground table: precomputed rays on a pixel lattice, interpolated bilinearly.
 
-A ground position grows without bound toward the horizon and so interpolates badly; the direction
-of the pixel's ray does not. The table therefore holds unit rays on a coarse lattice (8 px: 2.3 MB
-for a 3500 px crop) and the intersection with the ground is one division at look-up. Interpolating
-over 8 px bends a ray by some 1e-5 rad: about a millimetre at 25 m. Where a lens bends faster (the
-rim of an orthographic lens, a tiny image) the cell is found out while the table is built, by
-comparing its middle with the closed form, and answered in closed form from then on.
+Ground positions grow without bound toward the horizon and interpolate badly; ray directions do not.
+The table holds unit rays on a coarse lattice (8 px: 2.3 MB for a 3500 px crop); the intersection
+with the ground is one division at look-up. Interpolation over 8 px changes a ray by some 1e-5 rad,
+about a millimetre at 25 m. Cells where the lens bends faster (the rim of an orthographic lens, a
+tiny image) are found while building, by comparing the middle of each cell with the closed form, and
+are then always computed in closed form.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from bikeped.errors import GeometryError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.types import BoolArray, Float32Array, FloatArray
 
-#: A cell whose middle is off by more than this (at most at REACH_M) is answered in closed form.
+#: A cell whose middle is off by more than this (within REACH_M) is computed in closed form.
 TOLERANCE_M = 0.005
 REACH_M = 26.0
 _ROWS_AT_ONCE = 64  # keeps the temporary arrays in the cache, and the peak of memory low
 
 
 class GroundTable:
-    """Ground positions of the pixels of one camera's crop. Immutable after building."""
+    """Pixel to ground positions for one camera's crop. Immutable after building."""
 
     def __init__(self, camera: GroundCamera, width: int, height: int, step_px: int = 8) -> None:
         """Builds the table of a `width` x `height` crop with a lattice of `step_px` pixels."""
@@ -52,20 +52,15 @@ class GroundTable:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the table holds."""
+        """Memory of the table in bytes."""
         return self._rays.nbytes + self._exact.nbytes
-
-    @property
-    def exact_share(self) -> float:
-        """Share of the cells that are answered in closed form."""
-        return float(self._exact.mean())
 
     def lookup(self, uv_px: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Ground positions [n, 2] in metres of crop pixels [n, 2], and which are valid [n].
 
-        Within 1 cm of `GroundCamera.ground` out to 25 m. Invalid (NaN): outside the crop or the
-        image circle, on or above the horizon. The crop's far edges are inside: a box that is cut
-        by the picture's lower edge ends on it.
+        Within 1 cm of `GroundCamera.ground` up to 25 m. Invalid (NaN): outside the crop or the
+        image circle, on or above the horizon. The crop's far edges are inside: a box cut off by the
+        lower edge of the image ends on it.
         """
         uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
         u, v = uv[:, 0], uv[:, 1]
@@ -96,11 +91,10 @@ def _grid(u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def _close(ray: npt.NDArray[np.floating], truth: FloatArray, height_m: float) -> BoolArray:
-    """Whether a ray meets the ground within TOLERANCE_M of where the true one does.
+    """Whether `ray` meets the ground within TOLERANCE_M of the true ray [...].
 
     To first order the ground error is |d ray| * slant^2 / height along the line of sight. Rays
-    that meet the ground beyond REACH_M are held to the tolerance of REACH_M; NaN (a cell that the
-    rim of the image circle may cross) is never close.
+    beyond REACH_M have the tolerance of REACH_M; NaN (the rim of the image circle) is not close.
     """
     error = np.sqrt(((ray - truth) ** 2).sum(-1))
     slant_sq = (height_m / np.maximum(-truth[..., 2], 1e-9)) ** 2

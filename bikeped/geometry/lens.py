@@ -1,7 +1,7 @@
-"""Radial lens models: image radius against angle from the optical axis.
+"""Radial lens models: image radius as a function of the angle from the optical axis.
 
-The four fisheye projections of Kannala and Brandt (2006) and the ordinary perspective one, each
-with up to four radial terms:
+The four fisheye projections of Kannala and Brandt (2006) and the perspective projection, each with
+up to four radial terms:
 
     r(theta) = f * g(theta) * (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
@@ -11,8 +11,9 @@ which for the equidistant lens is the paper's r = f (theta + k1 theta^3 + k2 the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, cast
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +28,7 @@ _ALIASES = {"linear": "equidistant", "equalarea": "equisolid"}
 LIMITS: dict[str, float] = {
     "equidistant": math.pi,
     "equisolid": math.pi,
-    # Short of the pole at infinity, so that r stays finite.
+    # Less than 180 degrees, where r is infinite.
     "stereographic": math.radians(179.0),
     "orthographic": math.pi / 2,
     "perspective": math.radians(89.5),
@@ -35,10 +36,35 @@ LIMITS: dict[str, float] = {
 _SAMPLES = 2048
 
 
-def canonical_projection(name: str) -> Projection:
-    """The proper name of a projection; `linear` and `equalarea` are accepted beside it.
+class _Functions(NamedTuple):
+    """g(theta) for f = 1 without radial terms, its derivative, and its inverse."""
 
-    Raises GeometryError for a name that is none of them.
+    radius: Callable[[FloatArray], FloatArray]
+    slope: Callable[[FloatArray], FloatArray]
+    angle: Callable[[FloatArray], FloatArray]
+
+
+_FUNCTIONS = {
+    "equidistant": _Functions(lambda t: t, np.ones_like, lambda r: r),
+    "equisolid": _Functions(
+        lambda t: 2 * np.sin(t / 2),
+        lambda t: np.cos(t / 2),
+        lambda r: 2 * np.arcsin(np.minimum(r / 2, 1.0)),
+    ),
+    "stereographic": _Functions(
+        lambda t: 2 * np.tan(t / 2),
+        lambda t: 1 / np.cos(t / 2) ** 2,
+        lambda r: 2 * np.arctan(r / 2),
+    ),
+    "orthographic": _Functions(np.sin, np.cos, lambda r: np.arcsin(np.minimum(r, 1.0))),
+    "perspective": _Functions(np.tan, lambda t: 1 / np.cos(t) ** 2, np.arctan),
+}
+
+
+def canonical_projection(name: str) -> Projection:
+    """The canonical name of a projection; also accepts `linear` and `equalarea`.
+
+    Raises GeometryError for an unknown name.
     """
     proper = _ALIASES.get(name, name)
     if proper not in LIMITS:
@@ -48,52 +74,28 @@ def canonical_projection(name: str) -> Projection:
     return cast(Projection, proper)
 
 
-def curve(projection: str, theta: FloatArray) -> FloatArray:
-    """g(theta), the radius for f = 1 without radial terms."""
-    if projection == "equidistant":
-        return theta
-    if projection == "equisolid":
-        return np.asarray(2 * np.sin(theta / 2))
-    if projection == "stereographic":
-        return np.asarray(2 * np.tan(theta / 2))
-    if projection == "orthographic":
-        return np.asarray(np.sin(theta))
-    return np.asarray(np.tan(theta))
+def unit_radius(projection: str, theta: FloatArray) -> FloatArray:
+    """g(theta): image radius at angle `theta` (rad) for f = 1 without radial terms."""
+    return np.asarray(_FUNCTIONS[projection].radius(theta))
 
 
-def curve_slope(projection: str, theta: FloatArray) -> FloatArray:
+def unit_radius_slope(projection: str, theta: FloatArray) -> FloatArray:
     """dg/dtheta."""
-    if projection == "equidistant":
-        return np.ones_like(theta)
-    if projection == "equisolid":
-        return np.asarray(np.cos(theta / 2))
-    if projection == "stereographic":
-        return np.asarray(1 / np.cos(theta / 2) ** 2)
-    if projection == "orthographic":
-        return np.asarray(np.cos(theta))
-    return np.asarray(1 / np.cos(theta) ** 2)
+    return np.asarray(_FUNCTIONS[projection].slope(theta))
 
 
-def inverse_curve(projection: str, radius: FloatArray) -> FloatArray:
-    """theta for f = 1 without radial terms; radii outside the model give its limit."""
-    if projection == "equidistant":
-        return radius
-    if projection == "equisolid":
-        return np.asarray(2 * np.arcsin(np.minimum(radius / 2, 1.0)))
-    if projection == "stereographic":
-        return np.asarray(2 * np.arctan(radius / 2))
-    if projection == "orthographic":
-        return np.asarray(np.arcsin(np.minimum(radius, 1.0)))
-    return np.asarray(np.arctan(radius))
+def unit_angle(projection: str, radius: FloatArray) -> FloatArray:
+    """theta (rad) for f = 1 without radial terms; beyond the projection's range, its limit."""
+    return np.asarray(_FUNCTIONS[projection].angle(radius))
 
 
 @dataclass(frozen=True)
 class Lens:
-    """One lens: projection, focal length in pixels, radial terms, and the widest angle it answers.
+    """A lens: projection, focal length in pixels, radial terms k1..k4, half the field of view.
 
-    `max_theta_rad` (half the field of view) bounds what `theta` answers: beyond it the radius is
-    outside the image circle and the answer is NaN. Raises GeometryError when the radius does not
-    grow with the angle over that range, for then a pixel would have two directions.
+    Beyond `max_theta_rad` a radius is outside the image circle and `theta` is NaN. Raises
+    GeometryError when the radius does not increase with the angle up to there: a pixel would have
+    two directions.
     """
 
     projection: Projection
@@ -133,48 +135,48 @@ class Lens:
         fov_deg: float,
         k: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     ) -> Lens:
-        """The lens whose field of view ends at `radius_px`: f = 2R * 180 / (fov pi), equidistant.
+        """The lens whose field of view `fov_deg` ends at `radius_px`: f = R / g(fov / 2).
 
-        The focal length is that of the plain projection; radial terms bend it afterwards, as the
-        calibration file's convention has it.
+        `radius_px` is without the radial terms, as in the calibration file.
         """
         proper = canonical_projection(projection)
         half = math.radians(fov_deg) / 2
-        unit = float(curve(proper, np.asarray([min(half, LIMITS[proper])], dtype=np.float64))[0])
+        unit = float(
+            unit_radius(proper, np.asarray([min(half, LIMITS[proper])], dtype=np.float64))[0]
+        )
         if unit <= 0:
             raise GeometryError(f"fov_deg: {fov_deg} gives no focal length; use a positive angle")
         return Lens(proper, radius_px / unit, half, k)
 
     @property
     def max_radius_px(self) -> float:
-        """Radius of the image circle at the edge of the field of view."""
+        """Radius of the image circle, radial terms included."""
         return float(self._radius_table[-1])
 
     def radius(self, theta: npt.ArrayLike) -> FloatArray:
         """Image radius in pixels at angles `theta` (radians, any shape)."""
         angle = np.asarray(theta, dtype=np.float64)
-        base = curve(self.projection, angle)
+        base = unit_radius(self.projection, angle)
         if any(self.k):
             base = base * self._gain(angle)
         return self.focal_px * base
 
     def theta(self, radius_px: npt.ArrayLike) -> FloatArray:
-        """Angle in radians at image radii (any shape); NaN outside the image circle.
+        """Angles in radians at image radii `radius_px` (any shape); NaN outside the image circle.
 
-        Without radial terms in closed form; with them by Newton's method from a table, to 1e-12
-        of the radius.
+        Closed form without radial terms, else Newton's method from a table, to 1e-12 of the radius.
         """
         radius = np.asarray(radius_px, dtype=np.float64)
         inside = radius <= self.max_radius_px * (1 + 1e-12)
         unit = radius / self.focal_px
         if not any(self.k):
-            angle = inverse_curve(self.projection, unit)
+            angle = unit_angle(self.projection, unit)
         else:
             angle = np.interp(radius, self._radius_table, self._theta_table)
             for _ in range(4):  # quadratic from 1e-3 at worst: four steps reach the last bit
-                gain, bend = self._gain(angle), self._bend(angle)
-                base = curve(self.projection, angle)
-                slope = curve_slope(self.projection, angle) * gain + base * bend
+                gain, gain_slope = self._gain(angle), self._gain_slope(angle)
+                base = unit_radius(self.projection, angle)
+                slope = unit_radius_slope(self.projection, angle) * gain + base * gain_slope
                 with np.errstate(divide="ignore", invalid="ignore"):
                     step = np.where(slope > 1e-9, (base * gain - unit) / slope, 0.0)
                 angle = np.clip(angle - step, 0, self.max_theta_rad)
@@ -185,8 +187,7 @@ class Lens:
         sq = theta * theta
         return 1 + sq * (k1 + sq * (k2 + sq * (k3 + sq * k4)))
 
-    def _bend(self, theta: FloatArray) -> FloatArray:
-        """Derivative of the gain."""
+    def _gain_slope(self, theta: FloatArray) -> FloatArray:
         k1, k2, k3, k4 = self.k
         sq = theta * theta
         return theta * (2 * k1 + sq * (4 * k2 + sq * (6 * k3 + sq * 8 * k4)))

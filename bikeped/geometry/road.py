@@ -1,8 +1,7 @@
-"""Which part of the picture road users within range can be in: the rest needs no looking at. Pure.
+"""The part of the image in which road users within range can appear. Pure.
 
-A camera that hangs above everybody's head sees them all below the horizon. Half of its picture is
-sky and house fronts, and beside the image circle it is black: both cost a detector as much as the
-street does.
+A camera above head height sees them below the horizon. Half of its image is sky and house fronts,
+and outside the image circle it is black: both cost a detector as much time as the street does.
 """
 
 from __future__ import annotations
@@ -13,28 +12,28 @@ from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.types import Region
 
-TALLEST_M = 2.5  #: a tall rider on a tall cycle; lorries are cut off where they are higher
-MARGIN_DEG = 2.0  #: what pitch and roll of the camera may be off by
+MAX_HEIGHT_M = 2.5  #: of a rider on a cycle; higher vehicles are cut off
+MARGIN_DEG = 2.0  #: for errors of the camera's pitch and roll
 _NEAREST_M = 0.3
 _BEARINGS, _DISTANCES = 721, 40
 
 
 def road_region(camera: GroundCamera, framing: Framing, range_m: float) -> Region:
-    """The rectangle with everybody up to `TALLEST_M` tall and `range_m` away, in all directions.
+    """The rectangle of all points up to `MAX_HEIGHT_M` high and `range_m` away from the pole.
 
-    Distances are along the ground from below the lens. `MARGIN_DEG` is added on every side, as far
-    as the lens reaches. The whole picture where nobody would be in it.
+    `MARGIN_DEG` is added on every side, up to the image circle. The whole frame where no such point
+    is visible.
     """
     size = np.array([framing.sensor_w, framing.sensor_h], np.float64)
     aspect = framing.sensor_w / framing.sensor_h
     bearing = np.linspace(-np.pi, np.pi, _BEARINGS)
     away = np.geomspace(_NEAREST_M, max(range_m, 2 * _NEAREST_M), _DISTANCES)
-    tall = np.array([0.0, TALLEST_M / 2, TALLEST_M])
+    tall = np.array([0.0, MAX_HEIGHT_M / 2, MAX_HEIGHT_M])
     turn, reach, up = (a.ravel() for a in np.meshgrid(bearing, away, tall, indexing="ij"))
     uv, _ = camera.project(np.stack([reach * np.cos(turn), reach * np.sin(turn), up], axis=1))
     margin = camera.lens.focal_px * np.radians(MARGIN_DEG)
     axis, rim = np.array([camera.cx, camera.cy]), camera.lens.max_radius_px
-    # Also beside the lens, where a wide one still sees: `project` calls only those before it seen.
+    # Also behind the lens plane, which a wide lens sees and `project` calls not visible.
     seen = np.hypot(*(uv - axis).T) < rim * (1 - 1e-9)
     if camera.window_px is not None:
         low, high = np.array(camera.window_px[:2]), np.array(camera.window_px[2:])

@@ -226,3 +226,21 @@ def test_the_simulations_camera_looks_north():
     # North of the camera is forward; east of it is to its right.
     np.testing.assert_allclose(pose.world_to_ground([5.0, -3.0]), (10.0, 0.0), atol=1e-12)
     np.testing.assert_allclose(pose.world_to_ground([8.0, -13.0]), (0.0, 3.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("window_px", "visible"),
+    [
+        ((100, 80, 101, 81), True),
+        ((0, 0, 100, 81), False),
+        ((0, 0, 101, 80), False),
+        ((101, 0, 200, 160), False),
+        ((0, 81, 200, 160), False),
+    ],
+)
+def test_the_window_holds_its_first_and_not_its_end_pixel(window_px, visible):
+    lens = Lens.from_circle("equidistant", 100, 180)
+    camera = GroundCamera(lens, cx=100, cy=80, height_m=2, window_px=window_px)
+    uv, seen = camera.project([[5.0, 0.0, 2.0]])  # on the optical axis
+    assert uv.tolist() == [[100, 80]]
+    assert seen.tolist() == [visible]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from bikeped.config import load_config, road_region
 from bikeped.geometry import Framing, GroundCamera, Lens
 from bikeped.geometry import road_region as region_of
-from bikeped.geometry.road import TALLEST_M
+from bikeped.geometry.road import MAX_HEIGHT_M
 from bikeped.types import Region
 
 FRAME = Framing(960, 540)
@@ -27,7 +27,7 @@ def camera(height_m=3.6, pitch_deg=0.0, fov_deg=190.0, circle=480.0):
     st.floats(-45.0, 10.0),
     st.floats(120.0, 210.0),
     st.lists(
-        st.tuples(st.floats(-3.14, 3.14), st.floats(0.3, 25.0), st.floats(0.0, TALLEST_M)),
+        st.tuples(st.floats(-3.14, 3.14), st.floats(0.3, 25.0), st.floats(0.0, MAX_HEIGHT_M)),
         min_size=1,
         max_size=20,
     ),

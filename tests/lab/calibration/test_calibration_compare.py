@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from calibration_scenes import boards, camera, found
 
-from bikeped.geometry.lens import Projection, curve
+from bikeped.geometry.lens import Projection, unit_radius
 from bikeped.lab.calibration.report.calibration_file import field_of_view
 from bikeped.lab.calibration.report.results import result_data
 from bikeped.lab.calibration.solver.compare import (
@@ -115,7 +115,7 @@ def test_a_start_for_another_model_keeps_the_radii(bent: Calibrated) -> None:
     theta = angles(camera_points(state, prepared.sightings.flat))[prepared.sightings.seen]
     other = start_for(Model("equidistant", 4), replace(state), prepared)
     fitted = bent.fits["equisolid+k4"]
-    own = other.lens[2] * curve("equidistant", theta)
+    own = other.lens[2] * unit_radius("equidistant", theta)
     k = other.terms
     own = own * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
     assert np.abs(own - fitted.radius(theta)).max() < 3.0  # of 500 px

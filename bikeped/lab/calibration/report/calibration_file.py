@@ -15,7 +15,7 @@ from bikeped import __version__
 from bikeped.errors import CalibrationError, GeometryError
 from bikeped.files import write_whole
 from bikeped.geometry import Framing
-from bikeped.geometry.lens import LIMITS, curve
+from bikeped.geometry.lens import LIMITS, unit_radius
 from bikeped.lab.calibration.solver.compare import Calibrated
 from bikeped.lab.calibration.solver.lens_fit import Fit
 from bikeped.types import FloatArray
@@ -100,7 +100,7 @@ def calibration_data(
             f"{fit.name}: no lens over {fov_deg:.1f} degrees ({error}); fit fewer radial terms"
         ) from error
     sightings, prepared = fit.sightings, calibrated.prepared
-    unit = float(curve(fit.model.projection, np.asarray(half)))
+    unit = float(unit_radius(fit.model.projection, np.asarray(half)))
     k1, k2, k3, k4 = fit.state.terms
     return {
         "model": fit.model.projection,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bikeped.geometry.lens import LIMITS, curve
+from bikeped.geometry.lens import LIMITS, unit_radius
 from bikeped.lab.calibration.report.calibration_file import Field
 from bikeped.lab.calibration.solver.compare import Calibrated
 from bikeped.lab.calibration.solver.initial_guess import FISHEYE
@@ -156,7 +156,9 @@ def profile_figure(fit: Fit, field: Field) -> bytes:
         worst = 0.0
         for projection, (colour, _, dash) in zip(FISHEYE, SERIES, strict=False):
             inside = theta <= LIMITS[projection]
-            base = np.where(inside, curve(projection, np.minimum(theta, LIMITS[projection])), 0.0)
+            base = np.where(
+                inside, unit_radius(projection, np.minimum(theta, LIMITS[projection])), 0.0
+            )
             both = inside & measured
             focal = float((base[both] @ own[both]) / (base[both] @ base[both]))
             ideal = np.where(inside, focal * base, np.nan)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.geometry.lens import curve
+from bikeped.geometry.lens import unit_radius
 from bikeped.lab.calibration.solver.board_shape import gauge_basis, prior_weights
 from bikeped.lab.calibration.solver.jacobian import Jacobian, jacobian
 from bikeped.lab.calibration.solver.lens_model import (
@@ -161,7 +161,7 @@ def lens_grows(state: State, sightings: Sightings) -> bool:
         return True
     seen = angles(camera_points(state, sightings.flat))[sightings.seen]
     theta: FloatArray = np.linspace(0.0, float(np.quantile(seen, 0.98)), 200, dtype=np.float64)
-    radius = curve(state.projection, theta) * gain(theta, state.lens[PLAIN:])
+    radius = unit_radius(state.projection, theta) * gain(theta, state.lens[PLAIN:])
     return bool(np.all(np.diff(radius) > 0)) or state.projection == "orthographic"
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bikeped.errors import CalibrationError
-from bikeped.geometry.lens import Projection, curve
+from bikeped.geometry.lens import Projection, unit_radius
 from bikeped.lab.calibration.board_view import Refused
 from bikeped.lab.calibration.solver.initial_guess import FISHEYE
 from bikeped.lab.calibration.solver.lens_fit import Fit, fit
@@ -112,8 +112,8 @@ def start_for(model: Model, state: State, prepared: Prepared) -> State:
     """The same poses, and the lens of another model that comes nearest to this one's radii."""
     sightings = prepared.sightings
     theta = angles(camera_points(state, sightings.flat))[sightings.seen]
-    radius = state.lens[2] * curve(state.projection, theta) * gain(theta, state.lens[PLAIN:])
-    base = curve(model.projection, theta)
+    radius = state.lens[2] * unit_radius(state.projection, theta) * gain(theta, state.lens[PLAIN:])
+    base = unit_radius(model.projection, theta)
     columns = np.stack([base * theta ** (2 * n) for n in range(model.terms + 1)], axis=1)
     size = np.abs(columns).max(0)
     found, *_ = np.linalg.lstsq(columns / size, radius, rcond=None)

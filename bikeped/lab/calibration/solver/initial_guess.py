@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from bikeped.errors import CalibrationError
-from bikeped.geometry.lens import LIMITS, Projection, curve
+from bikeped.geometry.lens import LIMITS, Projection, unit_radius
 from bikeped.lab.calibration.solver.lens_model import (
     Sightings,
     State,
@@ -67,7 +67,7 @@ def _focal(projection: Projection, radius_px: float, theta: float) -> float | No
     """The focal length that puts `theta` at this radius; None beyond the projection's reach."""
     if theta > LIMITS[projection] * 0.98:
         return None
-    return radius_px / float(curve(projection, np.asarray(theta)))
+    return radius_px / float(unit_radius(projection, np.asarray(theta)))
 
 
 def picture_errors_px(state: State, sightings: Sightings) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.geometry.lens import curve, curve_slope
+from bikeped.geometry.lens import unit_radius, unit_radius_slope
 from bikeped.lab.calibration.solver.lens_model import PLAIN, State, board_points, gain
 from bikeped.types import FloatArray
 
@@ -55,10 +55,10 @@ def jacobian(state: State, flat: FloatArray, *, bent: bool = True) -> Jacobian:
     theta = np.arctan2(side, z)
 
     k = state.lens[..., PLAIN:]
-    base = curve(state.projection, theta)
+    base = unit_radius(state.projection, theta)
     grown = gain(theta, k)
     unit = base * grown
-    slope = curve_slope(state.projection, theta) * grown + base * _bend(theta, k)
+    slope = unit_radius_slope(state.projection, theta) * grown + base * _bend(theta, k)
     focal = state.lens[..., 2]
     ux, uy = x / side, y / side
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.geometry import Lens
-from bikeped.geometry.lens import curve
+from bikeped.geometry.lens import unit_radius
 from bikeped.lab.calibration.solver.board_shape import gauge_basis, prior_weights
 from bikeped.lab.calibration.solver.bundle_adjustment import Adjusted, Stage, adjust
 from bikeped.lab.calibration.solver.cross_validation import held_out_residuals
@@ -80,7 +80,7 @@ class Fit:
 
     def radius_sigma_px(self, theta: FloatArray) -> FloatArray:
         """One standard deviation of r(theta), from the covariance of f and the radial terms."""
-        base = curve(self.state.projection, theta)
+        base = unit_radius(self.state.projection, theta)
         slopes = [base * gain(theta, self.state.lens[PLAIN:])]
         slopes += [self.focal_px * base * theta ** (2 * n + 2) for n in range(self.model.terms)]
         rows = np.stack(slopes, axis=-1)
@@ -101,7 +101,7 @@ class Fit:
         """r(theta) in pixels, also where no `Lens` is valid."""
         return np.asarray(
             self.focal_px
-            * curve(self.state.projection, theta)
+            * unit_radius(self.state.projection, theta)
             * gain(theta, self.state.lens[PLAIN:])
         )
 

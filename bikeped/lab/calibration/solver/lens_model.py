@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.geometry.lens import Projection, curve, inverse_curve
+from bikeped.geometry.lens import Projection, unit_angle, unit_radius
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.types import BoolArray, FloatArray, IntArray
 
@@ -180,7 +180,7 @@ def project(state: State, points: FloatArray) -> FloatArray:
     side = np.hypot(points[..., 0], points[..., 1])
     theta = np.arctan2(side, points[..., 2])
     lens = state.lens
-    radius = lens[..., 2] * curve(state.projection, theta) * gain(theta, lens[..., PLAIN:])
+    radius = lens[..., 2] * unit_radius(state.projection, theta) * gain(theta, lens[..., PLAIN:])
     scale = radius / np.where(side > 0, side, 1.0)
     return np.asarray(points[..., :2] * scale[..., None] + lens[..., :2])
 
@@ -197,7 +197,7 @@ def bearings(
     """Unit rays [..., 3] in camera axes of pixels [..., 2], for a lens without radial terms."""
     offset = uv_px - centre_px
     radius = np.hypot(offset[..., 0], offset[..., 1])
-    theta = np.minimum(inverse_curve(projection, radius / focal_px), np.pi)
+    theta = np.minimum(unit_angle(projection, radius / focal_px), np.pi)
     side = np.sin(theta) / np.where(radius > 0, radius, 1.0)
     return np.concatenate([offset * side[..., None], np.cos(theta)[..., None]], axis=-1)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing
-from bikeped.geometry.lens import inverse_curve
+from bikeped.geometry.lens import unit_angle
 from bikeped.lab.calibration.board_view import BoardView, Found, Refused
 from bikeped.lab.calibration.solver.board_shape import alignment
 from bikeped.lab.calibration.solver.bundle_adjustment import Adjusted, adjust
@@ -173,7 +173,7 @@ def _is_fisheye(sightings: Sightings, state: State) -> None:
     centre = best.state.lens[:2]
     size = np.array([sightings.width - 1, sightings.height - 1])
     rim = np.hypot(*np.maximum(centre, size - centre)) / best.state.lens[2]
-    theta = float(np.degrees(inverse_curve(best.state.projection, np.asarray(rim))))
+    theta = float(np.degrees(unit_angle(best.state.projection, np.asarray(rim))))
     ordinary = adjust(
         sightings, Model("perspective"), first_guess(sightings, ("perspective",)), robust=False
     )
