@@ -1,4 +1,4 @@
-"""`bikeped demo`: a drawn crossing through the whole loop; needs no camera and no broker."""
+"""`bikeped demo`: a drawn crossing through the whole pipeline, without camera and broker."""
 
 from __future__ import annotations
 
@@ -7,18 +7,13 @@ from pathlib import Path
 
 import click
 
-from bikeped.cli.common import (
-    FiniteRange,
-    config_options,
-    json_option,
-    progress_bar,
-    write_json,
-)
+from bikeped.cli.common import FiniteRange, config_options, json_option, progress_bar, write_json
 from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.cli.web_options import open_pages, say_where, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
+from bikeped.lab.cli.model_shared import report
 
 SIZE = (1920, 1080)
 FPS = 30
@@ -36,7 +31,7 @@ FPS = 30
 @click.option(
     "--seconds",
     type=FiniteRange(min=0.1),
-    help="Only the beginning: so many seconds of the crossing.",
+    help="Run only the first seconds of the crossing.",
 )
 @web_option
 @json_option
@@ -49,9 +44,9 @@ def command(
     web_place: str | None,
     json_path: str | None,
 ) -> None:
-    """Draw a scripted crossing as fisheye video and run it through the whole loop.
+    """Draw a scripted crossing as fisheye video and replay it through the whole pipeline.
 
-    Without a configured detector the bundled one looks at the pictures.
+    Uses the bundled detector where none is configured.
     """
     from bikeped.lab.demo import bundled_scenario, format_summary, summarise
     from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera, sidecar_path
@@ -72,17 +67,15 @@ def command(
     if pages is not None and (refused := port_error(loaded.config.web)) is not None:
         raise BikepedError(refused)  # before a minute of drawing, not after
     make_folder(out)
-    check_outputs(
-        [("-c", config_path)] if config_path is not None else [],
-        [("--out", name) for name in names]
-        + [("--json", name) for name in written_paths(json_path)],
-    )
+    outputs = [("--out", name) for name in names]
+    outputs += [("--json", name) for name in written_paths(json_path)]
+    check_outputs([("-c", config_path)] if config_path is not None else [], outputs)
     scenario = load_scenario(bundled_scenario())
     painter = ScenePainter(scenario, scene_camera(loaded, SIZE), Conditions())
     frames = len(frame_times(painter, FPS, seconds))
-    with progress_bar("drawing", frames) as tell:
-        write_clip(painter, clip, fps=FPS, seconds=seconds, progress=lambda done, _: tell(done))
-    with progress_bar("replaying", frames) as tell:
+    with progress_bar("drawing", frames) as progress:
+        write_clip(painter, clip, fps=FPS, seconds=seconds, progress=progress)
+    with progress_bar("replaying", frames) as progress:
         result = replay(
             loaded,
             str(clip),
@@ -90,7 +83,7 @@ def command(
             files=ReplayFiles(events, overlay),
             realtime=pages is not None,
             mqtt=False,
-            progress=tell,
+            progress=progress,
             pages=pages,
             serving=say_where,
         )
@@ -105,14 +98,10 @@ def command(
     text = format_summary(summary)
     write_whole(out / "summary.txt", text)
     write_json(summary, str(out / "summary.json"))
-    if json_path is not None:
-        write_json(summary, json_path)
-    if json_path != "-":
-        click.echo(text)
-        for name, what in (
-            (overlay, "what the box saw and decided"),
-            (events, "every frame as JSON"),
-            (clip, "the drawn fisheye video"),
-            (out / "summary.json", "this summary"),
-        ):
-            click.echo(f"  {name}  {what}")
+    written = (
+        f"  {overlay}  detections, tracks and decisions as video",
+        f"  {events}  every frame as JSON",
+        f"  {clip}  the drawn fisheye video",
+        f"  {out / 'summary.json'}  this summary",
+    )
+    report(summary, json_path, (text, *written))

@@ -7,18 +7,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from bikeped.cli.common import (
-    FiniteRange,
-    config_options,
-    console,
-    json_option,
-    progress_bar,
-    write_json,
-)
-from bikeped.cli.guard import check_outputs, guarded
+from bikeped.cli.common import FiniteRange, config_options, json_option, progress_bar
+from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.config import load_config
 from bikeped.errors import BikepedError, require
-from bikeped.lab.cli.conformance_shared import print_table
+from bikeped.lab.cli.conformance_shared import rich_table
+from bikeped.lab.cli.model_shared import data_argument, data_files, images_option, report
 
 if TYPE_CHECKING:
     from bikeped.lab.result_tables import CellValue, ResultTable
@@ -28,34 +22,29 @@ if TYPE_CHECKING:
 
 @click.command("evaluate")
 @click.argument("models", nargs=-1, required=True, metavar="MODEL...")
-@click.argument("data", type=click.Path(path_type=Path))
+@data_argument
 @config_options
-@click.option(
-    "--images",
-    "images_dir",
-    type=click.Path(path_type=Path),
-    help="Folder that the data's file names start from, where it is not found by itself.",
-)
+@images_option
 @click.option(
     "--confidence",
     type=FiniteRange(0.0001, 1),
     default=0.001,
     show_default=True,
-    help="Least confidence for classes and merged kinds; what is deployed has its own.",
+    help="Confidence threshold for classes and merged kinds; deployed ones use detection's.",
 )
 @click.option(
     "--iou",
     type=FiniteRange(0.01, 1),
     default=0.65,
     show_default=True,
-    help="Overlap at which the weaker box goes, for classes and merged kinds.",
+    help="IoU threshold of non-maximum suppression, for classes and merged kinds.",
 )
 @click.option(
     "--curve",
     "curve_out",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Recall against area of the last MODEL, as conformance reads it with --recall-curve.",
+    help="Write the last MODEL's recall against area, as `conformance --recall-curve` reads it.",
 )
 @click.option(
     "--curve-iou",
@@ -69,13 +58,13 @@ if TYPE_CHECKING:
     type=click.IntRange(1),
     default=20,
     show_default=True,
-    help="A bin of the curve with fewer objects joins the next.",
+    help="Merge a bin of the curve with fewer objects into the next.",
 )
 @click.option(
     "--figure",
     type=click.Path(path_type=Path),
     metavar="FILE.png",
-    help="Draw it as PNG, and as PDF beside it.",
+    help="Draw the results as PNG, and as PDF beside it.",
 )
 @json_option
 @guarded
@@ -92,10 +81,10 @@ def command(
     least_objects: int,
     figure: Path | None,
     json_path: str | None,
-) -> int:
+) -> None:
     """Measure each MODEL (FILE or NAME=FILE) over DATA in COCO's format.
 
-    With several models each is compared with the first: original before fisheye-trained.
+    With several models each is compared with the first, e.g. the original with the retrained one.
     """
     from bikeped.lab.training.coco import read_coco
     from bikeped.lab.training.evaluate import EvaluationSettings, evaluate, load_models, write_curve
@@ -106,19 +95,11 @@ def command(
             raise BikepedError(f"--figure {figure}: is no .png; name one, a PDF comes beside it")
     source = read_coco(data, images_dir)
     named = [_named(word) for word in models]
-    outputs = [("--curve", curve_out), ("--figure", figure)]
+    outputs = [("--curve", path) for path in written_paths(curve_out)]
+    outputs += [("--json", path) for path in written_paths(json_path)]
     if figure is not None:
-        outputs.append(("--figure", figure.with_suffix(".pdf")))
-    if json_path not in (None, "-"):
-        outputs.append(("--json", Path(str(json_path))))
-    check_outputs(
-        [
-            ("DATA", source.source),
-            *(("DATA", image.path) for image in source.images),
-            *(("MODEL", path) for _, path in named),
-        ],
-        [(name, path) for name, path in outputs if path is not None],
-    )
+        outputs += [("--figure", figure), ("--figure", figure.with_suffix(".pdf"))]
+    check_outputs([*data_files(source), *(("MODEL", path) for _, path in named)], outputs)
     detection = load_config(config_path, overrides).config.detection
     loaded = load_models(named, detection)
     settings = EvaluationSettings(confidence, iou, least_objects)
@@ -132,16 +113,8 @@ def command(
         from bikeped.lab.training.evaluation_figures import draw_evaluation
 
         written += draw_evaluation(result, figure)
-    if json_path is not None:
-        write_json(result.as_dict(), json_path)
-    if json_path != "-":
-        screen = console()
-        for table in tables(result):
-            print_table(screen, table)
-            screen.print()
-        for path in written:
-            click.echo(f"wrote {path}")
-    return 0
+    shown = [part for table in tables(result) for part in (rich_table(table), "")]
+    report(result.as_dict(), json_path, [*shown, *(f"wrote {path}" for path in written)])
 
 
 def tables(result: Evaluation) -> list[ResultTable]:
@@ -155,7 +128,7 @@ def tables(result: Evaluation) -> list[ResultTable]:
     note = f"{data['images']} pictures, {data['objects']} objects"
     if unknown:
         some = ", ".join(unknown[:6]) + (", ..." if len(unknown) > 6 else "")
-        note += f"; not known to every model and so left out of the classes: {some}"
+        note += f"; classes left out, as not every model has them: {some}"
     main = ResultTable("detection", "detection", *_compared(result, rows), note)
     sizes = ResultTable(
         "by_size",
@@ -181,7 +154,7 @@ def tables(result: Evaluation) -> list[ResultTable]:
 
 
 def _alarms(result: Evaluation) -> ResultTable:
-    """False alarms of what is deployed."""
+    """False positives as deployed."""
     from bikeped.lab.result_tables import ResultTable
     from bikeped.lab.training.evaluate import KIND_NAMES
 
@@ -198,7 +171,7 @@ def _alarms(result: Evaluation) -> ResultTable:
 
 
 def _distances(result: Evaluation) -> ResultTable:
-    """Recall against distance, where the data tell it."""
+    """Recall against distance, where the data record it."""
     from bikeped.lab.result_tables import ResultTable
 
     first = result.scores[0].by_distance
@@ -241,7 +214,7 @@ def _three(value: float | None) -> float | None:
 
 
 def _named(word: str) -> tuple[str, Path]:
-    """NAME=FILE, or a file that is called by its own name."""
+    """Label and file of NAME=FILE, or of a file, which is labelled by its name."""
     path = Path(word)
     name, equals, file = word.partition("=")
     if equals and name and not path.exists():

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
 
-from bikeped.cli.common import console, json_option, width_height, write_json
+from bikeped.cli.common import json_option
 from bikeped.cli.guard import guarded
 from bikeped.errors import DetectorError, require
+from bikeped.lab.cli.model_shared import picture_size, report
 
 
 @click.command("export")
@@ -18,41 +19,41 @@ from bikeped.errors import DetectorError, require
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="The ONNX file. Default: WEIGHTS with .onnx; nothing where WEIGHTS is ONNX already.",
+    help="The ONNX file. Default: WEIGHTS with .onnx; none where WEIGHTS is ONNX already.",
 )
 @click.option(
     "--engine",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Build a TensorRT engine, too; on the Jetson that will run it.",
+    help="Also build a TensorRT engine; on the Jetson that will run it.",
 )
 @click.option(
     "--size",
     type=click.IntRange(64, 4096),
     default=1280,
     show_default=True,
-    help="Side of the square input of a YOLO; the small network knows its own.",
+    help="Side of a YOLO's square input; weights of the small network record theirs.",
 )
 @click.option(
     "--input",
     "input_size",
     metavar="WIDTHxHEIGHT",
-    help="Size of the engine's input, multiples of 32, for a model that takes any. "
-    "Default: what the model says.",
+    help="Input size of the engine, multiples of 32, for a model of any size. Default: what its "
+    "metadata say.",
 )
 @click.option(
     "--int8",
     type=click.Path(path_type=Path),
     metavar="DATA",
-    help="Round the small network to eight bits: quicker on a processor without a GPU. "
-    "DATA: pictures in COCO's format that the steps are taken from.",
+    help="Quantise the small network to eight bits, for a processor without a GPU. DATA: pictures "
+    "in COCO's format to calibrate with.",
 )
-@click.option("--full-precision", is_flag=True, help="An engine without 16-bit floats.")
+@click.option("--full-precision", is_flag=True, help="Build the engine without 16-bit floats.")
 @click.option(
     "--workspace-mb",
     type=click.IntRange(16, 1 << 20),
     default=2048,
     show_default=True,
-    help="Memory that TensorRT may try plans with.",
+    help="Memory for TensorRT's search, MB.",
 )
 @json_option
 @guarded
@@ -66,12 +67,12 @@ def command(
     full_precision: bool,
     workspace_mb: int,
     json_path: str | None,
-) -> int:
-    """Export WEIGHTS (weights.pt of `model train`, or an .onnx file) to ONNX and TensorRT."""
+) -> None:
+    """Export WEIGHTS (weights.pt of `model train`, or an .onnx file) to ONNX or TensorRT."""
     summary: dict[str, Any] = {}
     if int8 is not None and (engine is not None or weights.suffix.lower() == ".onnx"):
         raise DetectorError(
-            f"--int8: rounds what `model train` wrote, for a processor; leave out "
+            f"--int8: rounds the weights of `model train`, for a processor; leave out "
             f"{'--engine' if engine is not None else 'the ONNX file and name weights.pt'}"
         )
     if weights.suffix.lower() == ".onnx":
@@ -82,59 +83,40 @@ def command(
             )
         model = weights
     else:
+        model = weights.with_suffix(".onnx") if out is None else out
+        _check_suffix(model, ".onnx")
+    input_wh = None if input_size is None else picture_size("--input", input_size, 32)
+    if engine is not None:
+        _check_suffix(engine, ".engine")
+    if model != weights:
         require("torch")
         from bikeped.lab.training.export import export_any
 
-        model = weights.with_suffix(".onnx") if out is None else out
-        _expect(model, ".onnx")
         summary = export_any(weights, model, size, int8)
     if engine is not None:
         from bikeped.lab.training.engine import build_engine
 
-        _expect(engine, ".engine")
-        built = build_engine(
-            model,
-            engine,
-            half=not full_precision,
-            workspace_mb=workspace_mb,
-            size=None if input_size is None else _size(input_size),
-        )
+        half = not full_precision
+        built = build_engine(model, engine, half=half, workspace_mb=workspace_mb, size=input_wh)
         summary |= built.as_dict()
-    if json_path is not None:
-        write_json(summary, json_path)
-    if json_path != "-":
-        _print(summary)
-    return 0
+    report(summary, json_path, _lines(summary))
 
 
-def _expect(path: Path, suffix: str) -> None:
+def _check_suffix(path: Path, suffix: str) -> None:
     if path.suffix.lower() != suffix:
-        raise DetectorError(f"{path}: bikeped knows a model by its name; end it with {suffix}")
+        raise DetectorError(f"{path}: models are told apart by suffix; end it with {suffix}")
 
 
-def _size(text: str) -> tuple[int, int]:
-    size = width_height(text)
-    if size is None or any(side % 32 or side == 0 for side in size):
-        raise DetectorError(
-            f"--input {text}: is no WIDTHxHEIGHT in multiples of 32; for example 1280x416"
-        )
-    return size
-
-
-def _print(summary: dict[str, Any]) -> None:
-    screen = console()
+def _lines(summary: dict[str, Any]) -> Iterator[str]:
     if "model" in summary:
-        screen.print(
-            escape(
-                f"wrote {summary['model']}: {summary['bytes'] / 1e6:.2f} MB, input "
-                f"{summary['size'][0]} x {summary['size'][1]}, {', '.join(summary['names'])}; "
-                f"boxes within {summary['largest_box_difference_px']:.2g} px of PyTorch's"
-            )
+        width, height = summary["size"]
+        yield (
+            f"wrote {summary['model']}: {summary['bytes'] / 1e6:.2f} MB, input {width} x {height}, "
+            f"{', '.join(summary['names'])}; "
+            f"boxes within {summary['largest_box_difference_px']:.2g} px of PyTorch's"
         )
     if "engine" in summary:
-        screen.print(
-            escape(
-                f"wrote {summary['engine']}: {summary['engine_bytes'] / 1e6:.2f} MB, TensorRT "
-                f"{summary['tensorrt']}, {'16' if summary['half_precision'] else '32'}-bit"
-            )
+        yield (
+            f"wrote {summary['engine']}: {summary['engine_bytes'] / 1e6:.2f} MB, TensorRT "
+            f"{summary['tensorrt']}, {'16' if summary['half_precision'] else '32'}-bit"
         )

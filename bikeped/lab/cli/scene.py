@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.markup import escape
 
-from bikeped.cli.common import (
-    FiniteRange,
-    config_options,
-    console,
-    json_option,
-    progress_bar,
-    width_height,
-    write_json,
-)
+from bikeped.cli.common import FiniteRange, config_options, json_option, progress_bar
 from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError, GeometryError, ScenarioError
 from bikeped.files import write_whole
+from bikeped.lab.cli.model_shared import picture_size, report
 
 if TYPE_CHECKING:
     from bikeped.lab.rendering import DrawnObject, SceneCamera, ScenePainter
@@ -39,9 +32,9 @@ _COLOURS = ((255, 70, 60), (70, 230, 90), (70, 160, 255))
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="The clip (.avi, Motion JPEG; boxes go beside it), or the data set's folder.",
+    help="Clip to write (.avi, Motion JPEG; boxes beside it), or the data set's folder.",
 )
-@click.option("--size", default="1920x1080", show_default=True, help="Of the pictures, in pixels.")
+@click.option("--size", default="1920x1080", show_default=True, help="Picture size, in pixels.")
 @click.option("--light", type=click.Choice(_LIGHTS), default="day", show_default=True)
 @click.option("--weather", type=click.Choice(["dry", "rain"]), default="dry", show_default=True)
 @click.option(
@@ -49,37 +42,37 @@ _COLOURS = ((255, 70, 60), (70, 230, 90), (70, 160, 255))
     type=click.IntRange(0, 2**31 - 1),
     default=0,
     show_default=True,
-    help="Road layout, houses and occluders by number.",
+    help="Number of the street: road layout, houses and occluders.",
 )
 @click.option(
     "--seed",
     type=click.IntRange(0, 2**31 - 1),
     default=0,
     show_default=True,
-    help="Clothes, sun, noise; with --dataset everything.",
+    help="Seed of clothes, sun and noise; with --dataset, of everything.",
 )
 @click.option("--fps", type=click.IntRange(1, 240), default=30, show_default=True)
-@click.option("--seconds", type=FiniteRange(min=0.001), help="Only the beginning.")
+@click.option("--seconds", type=FiniteRange(min=0.001), help="Draw only the first seconds.")
 @click.option("--quality", type=click.IntRange(1, 100), default=88, show_default=True)
 @click.option(
     "--still",
     type=(float, click.Path(path_type=Path)),
     metavar="T FILE.png",
-    help="One picture at T seconds in place of a clip.",
+    help="Draw one picture at T seconds in place of a clip.",
 )
 @click.option("--boxes", is_flag=True, help="Draw the boxes into the still.")
 @click.option(
     "--dataset",
     type=click.IntRange(1, 1_000_000),
     metavar="N",
-    help="N random pictures with COCO annotations into the folder --out; takes no SCENARIO.",
+    help="Draw N random pictures with COCO annotations into the folder --out; no SCENARIO.",
 )
 @click.option(
     "--lens",
     type=click.Choice(["configured", "fisheye", "rectilinear"]),
     default="configured",
     show_default=True,
-    help="Cameras of a data set: the configured one, or random ones of a sort.",
+    help="Cameras of a data set: the configured one, or random fisheye or rectilinear ones.",
 )
 @json_option
 @guarded
@@ -102,18 +95,18 @@ def command(
     lens: str,
     json_path: str | None,
 ) -> None:
-    """Draw SCENARIO (a file, or the name of a bundled one) as the configured camera sees it."""
+    """Render SCENARIO, a file or a bundled one's name, through the configured camera."""
     from bikeped.lab.rendering import Conditions, ScenePainter, sidecar_path
 
     loaded = load_config(config_path, overrides)
-    wide_high = _size(size)
+    size_wh = picture_size("--size", size)
     if dataset is not None:
         if scenario is not None:
             raise BikepedError(f"{scenario}: --dataset draws its own scenarios; leave it out")
         if out is None or still is not None:
             raise BikepedError("--dataset: takes --out FOLDER and no --still; name a new folder")
-        summary = _dataset(loaded, out, dataset, seed, wide_high, lens)
-        _tell(summary, json_path, f"wrote {dataset} pictures and {summary['annotations']}")
+        summary = _dataset(loaded, out, dataset, seed, size_wh, lens)
+        report(summary, json_path, [f"wrote {dataset} pictures and {summary['annotations']}"])
         return
     if scenario is None:
         raise BikepedError(
@@ -121,31 +114,30 @@ def command(
         )
     if (out is None) == (still is None):  # one of them
         raise BikepedError("--out: give either --out CLIP.avi or --still T FILE.png")
-    found = _scenario(scenario)
-    source = Path(found.source)
-    conditions = Conditions(seed=seed, light=light, weather=weather, place=place)
-    view = _camera(loaded, wide_high)
-    read = [("SCENARIO", source)] + ([("-c", config_path)] if config_path else [])
-    told = [("--json", name) for name in written_paths(json_path)]
-    if still is not None:
-        if seconds is not None:
-            raise BikepedError("--seconds: is for a clip; leave it out with --still")
-        check_outputs(read, [("--still", still[1]), *told])
-        summary = _still(ScenePainter(found, view, conditions), *still, boxes=boxes)
-        _tell(summary, json_path, f"wrote {still[1]}: {len(summary['objects'])} objects")
-        return
-    if out is None:
-        return
-    if boxes:
+    if still is not None and seconds is not None:
+        raise BikepedError("--seconds: is for a clip; leave it out with --still")
+    if still is None and boxes:
         raise BikepedError("--boxes: goes with --still; a clip's boxes lie beside it")
-    check_outputs(read, [("--out", out), ("the boxes beside --out", sidecar_path(out)), *told])
-    summary = _clip(ScenePainter(found, view, conditions), out, fps, quality, seconds)
-    _tell(
-        summary,
-        json_path,
-        f"wrote {out}: {summary['frames']} frames of {size}, {summary['duration_s']:.1f} s; "
-        f"boxes in {summary['boxes']}",
-    )
+    found = _scenario(scenario)
+    read = [("SCENARIO", Path(found.source)), *([("-c", config_path)] if config_path else [])]
+    outputs = [("--json", name) for name in written_paths(json_path)]
+    if out is not None:
+        outputs += [("--out", out), ("the boxes beside --out", sidecar_path(out))]
+    if still is not None:
+        outputs.append(("--still", still[1]))
+    check_outputs(read, outputs)
+    conditions = Conditions(seed=seed, light=light, weather=weather, place=place)
+    painter = ScenePainter(found, _camera(loaded, size_wh), conditions)
+    if still is not None:
+        summary = _still(painter, *still, boxes=boxes)
+        line = f"wrote {still[1]}: {len(summary['objects'])} objects"
+    elif out is not None:
+        summary = _clip(painter, out, fps, quality, seconds)
+        line = (
+            f"wrote {out}: {summary['frames']} frames of {size}, {summary['duration_s']:.1f} s; "
+            f"boxes in {summary['boxes']}"
+        )
+    report(summary, json_path, _shown(summary, line))
 
 
 def _clip(
@@ -154,17 +146,11 @@ def _clip(
     from bikeped.lab.rendering import read_sidecar, write_clip
     from bikeped.lab.rendering.clip import frame_times
 
-    times = frame_times(painter, fps, seconds)
-    with progress_bar("drawing", len(times)) as tell:
-        beside = write_clip(
-            painter,
-            out,
-            fps=fps,
-            quality=quality,
-            seconds=seconds,
-            progress=lambda done, _: tell(done),
+    with progress_bar("drawing", len(frame_times(painter, fps, seconds))) as progress:
+        sidecar = write_clip(
+            painter, out, fps=fps, quality=quality, seconds=seconds, progress=progress
         )
-    truth = read_sidecar(beside)
+    truth = read_sidecar(sidecar)
     seen: dict[str, set[int]] = {}
     for frame in truth.frames:
         for item in frame:
@@ -172,7 +158,7 @@ def _clip(
     return {
         "scenario": painter.scenario.name,
         "clip": str(out),
-        "boxes": str(beside),
+        "boxes": str(sidecar),
         "frames": len(truth.frames),
         "duration_s": round(len(truth.frames) / fps, 3),
         "size": list(painter.camera.size),
@@ -233,16 +219,11 @@ def _dataset(
 ) -> dict[str, Any]:
     from bikeped.lab.rendering.dataset import write_dataset
 
-    camera = _camera(loaded, size) if lens == "configured" else None
-    with progress_bar("drawing", count) as tell:
+    own = lens == "configured"
+    camera, drawn_lens = (_camera(loaded, size), "fisheye") if own else (None, lens)
+    with progress_bar("drawing", count) as progress:
         annotations = write_dataset(
-            out,
-            count,
-            seed,
-            camera,
-            size=size,
-            lens="fisheye" if lens == "configured" else lens,
-            progress=lambda done, _: tell(done),
+            out, count, seed, camera, size=size, lens=drawn_lens, progress=progress
         )
     return {
         "folder": str(out),
@@ -282,33 +263,21 @@ def _scenario(name: str) -> Scenario:
         if slug in {_slug(scenario.name), Path(scenario.source).stem}:
             return scenario
     names = ", ".join(Path(scenario.source).stem for scenario in known)
-    raise ScenarioError(f"{name}: is no scenario file and no bundled scenario; known: {names}")
+    raise ScenarioError(f"{name}: is no scenario file and no bundled scenario; use one of {names}")
 
 
 def _slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
-def _size(text: str) -> tuple[int, int]:
-    size = width_height(text)
-    if size is None:
-        raise BikepedError(f"--size {text}: is not WIDTHxHEIGHT; write e.g. 1920x1080")
-    return size
-
-
-def _tell(summary: dict[str, Any], json_path: str | None, line: str) -> None:
-    if json_path is not None:
-        write_json(summary, json_path)
-    if json_path == "-":
-        return
-    screen = console(json_path)
-    screen.print(escape(line))
+def _shown(summary: dict[str, Any], line: str) -> Iterator[str]:
+    yield line
     if "seen" in summary:
-        shown = ", ".join(f"{count} {kind}" for kind, count in summary["seen"].items()) or "nobody"
-        screen.print(f"in it: {shown}")
+        seen = ", ".join(f"{count} {kind}" for kind, count in summary["seen"].items())
+        yield f"road users in it: {seen or 'none'}"
     for item in summary.get("objects", ()):
         u1, v1, u2, v2 = item["box_px"]
-        screen.print(
+        yield (
             f"  {item['id']:>4} {item['kind']:<11}{item['distance_m']:6.2f} m  "
             f"box {u1:.0f} {v1:.0f} {u2:.0f} {v2:.0f}  visible {item['visible']:.0%}"
         )

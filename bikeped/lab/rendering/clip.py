@@ -54,12 +54,12 @@ def write_clip(
     fps: int = 30,
     quality: int = 88,
     seconds: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Draws the painter's scenario into `path` (.avi, Motion JPEG) and its boxes beside it.
+    """Draws the painter's scenario into `path` (.avi, Motion JPEG); returns the sidecar's path.
 
-    Returns the boxes' file. Both are whole or not there. `seconds` ends the clip early; `progress`
-    is called with frames done and in all. Raises CaptureError when a file cannot be written.
+    Both files are whole or not there. `seconds` ends the clip early; `progress` takes the number of
+    frames done. Raises CaptureError when a file cannot be written.
     """
     if path.suffix.lower() != ".avi":
         raise CaptureError(f"{path}: is not an .avi name; end the clip's name with .avi")
@@ -74,8 +74,7 @@ def write_clip(
             image, objects = painter.draw(t)
             clip.write(encode_jpeg(image, quality))
             lines.append(json.dumps(_line(number, t, objects)))
-            if progress is not None:
-                progress(number + 1, len(times))
+            progress(number + 1)
         # Before the clip gets its name: no clip without its boxes.
         sidecar = sidecar_path(path)
         write_whole(sidecar, "\n".join(lines) + "\n")

@@ -73,7 +73,7 @@ def write_dataset(
     size: tuple[int, int] = (960, 540),
     lens: str = "fisheye",
     mix: SceneMix = DEFAULT_MIX,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
     """Writes `folder`/images/*.jpg and `folder`/annotations.json; returns the latter.
 
@@ -93,7 +93,7 @@ def write_dataset(
     drawn = pictures(count, seed, camera, size=size, lens=lens, mix=mix)
     try:
         with whole_folder(folder) as partial:
-            _write_pictures(partial, drawn, seed, lens, count, progress)
+            _write_pictures(partial, drawn, {"seed": seed, "lens": lens}, progress)
     except OSError as error:
         raise BikepedError(
             f"{folder}: cannot be written ({error.strerror}); choose another folder, or check the "
@@ -105,17 +105,15 @@ def write_dataset(
 def _write_pictures(
     folder: Path,
     drawn: Iterator[DrawnPicture],
-    seed: int,
-    lens: str,
-    count: int,
-    progress: Callable[[int, int], None] | None,
+    info: dict[str, Any],
+    progress: Callable[[int], None],
 ) -> None:
     (folder / "images").mkdir()
     images: list[dict[str, Any]] = []
     notes: list[dict[str, Any]] = []
     for number, one in enumerate(drawn):
         name = f"{number:06d}.jpg"
-        quality = 78 + (seed * 7 + number * 5) % 18
+        quality = 78 + (info["seed"] * 7 + number * 5) % 18
         (folder / "images" / name).write_bytes(encode_jpeg(one.image, quality))
         images.append(
             {
@@ -128,10 +126,9 @@ def _write_pictures(
             }
         )
         notes += [_annotation(len(notes) + i + 1, number + 1, o) for i, o in enumerate(one.objects)]
-        if progress is not None:
-            progress(number + 1, count)
+        progress(number + 1)
     data = {
-        "info": {"description": "drawn by bikeped", "seed": seed, "lens": lens},
+        "info": {"description": "drawn by bikeped", **info},
         "images": images,
         "annotations": notes,
         "categories": CATEGORIES,

@@ -94,15 +94,23 @@ def test_only_what_was_trained_is_rounded(tmp_path, capsys):
     assert "leave out --engine" in said(capsys)
 
 
-@with_torch
-def test_options_of_the_other_network_are_refused(data, tmp_path, capsys):
-    base = ["model", "train", str(data), "--out", str(tmp_path / "out"), "--network", "small"]
+def test_options_of_the_other_network_are_refused_before_anything_is_made(data, tmp_path, capsys):
+    out = tmp_path / "out"
+    base = ["model", "train", str(data), "--out", str(out), "--network", "small"]
     assert main([*base, "--weights", str(tmp_path / "w.pt")]) == 2
     assert "--weights is for a YOLO" in said(capsys)
-    assert main([*base, "--device", "moon"]) == 2
-    assert "--device moon" in said(capsys)
+    assert main([*base, "--validation", str(data)]) == 2
+    assert "--validation is for a YOLO" in said(capsys)
     assert main([*base[:-1], "yolov9-t", "--mine"]) == 2
     assert "--mine is for --network small" in said(capsys)
+    assert not out.exists()
+
+
+@with_torch
+def test_an_unknown_device_is_refused(data, tmp_path, capsys):
+    base = ["model", "train", str(data), "--out", str(tmp_path / "out"), "--network", "small"]
+    assert main([*base, "--device", "moon"]) == 2
+    assert "--device moon" in said(capsys)
 
 
 @with_torch

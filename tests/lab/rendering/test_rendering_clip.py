@@ -94,7 +94,7 @@ def test_the_same_clip_twice_is_the_same_bytes(
 
 
 def test_a_clip_that_fails_leaves_nothing(painter: ScenePainter, tmp_path: Path) -> None:
-    def fail(done: int, total: int) -> None:
+    def fail(done: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
 
@@ -165,7 +165,7 @@ def test_a_data_set_is_coco_and_repeats(tmp_path: Path) -> None:
 
 
 def test_a_data_set_is_whole_or_not_there(tmp_path: Path) -> None:
-    def fail(done: int, total: int) -> None:
+    def fail(done: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
