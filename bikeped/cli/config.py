@@ -10,7 +10,7 @@ import msgspec
 
 from bikeped.cli.common import config_options, json_option, write_json
 from bikeped.cli.guard import guarded
-from bikeped.config import Config, framing, ground_camera, load_config
+from bikeped.config import framing, ground_camera, load_config
 from bikeped.errors import ConfigError
 from bikeped.geometry import GroundTable
 from bikeped.models import model_file
@@ -81,14 +81,10 @@ def show(config_path: Path | None, overrides: tuple[str, ...], json_path: str | 
 @guarded
 def schema(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
     """Show the JSON Schema of the configuration."""
+    from bikeped.config.docs import json_schema
+
     data = json_schema()
     if json_path is not None and json_path != "-":
         write_json(data, json_path)
     else:
         click.echo(json.dumps(data, indent=2))
-
-
-def json_schema() -> dict[str, object]:
-    """The JSON Schema of config.yaml."""
-    data = msgspec.json.schema(Config)
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **data}

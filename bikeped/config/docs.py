@@ -1,7 +1,12 @@
-"""`python -m bikeped.config.docs docs/configuration.md` writes the page from `sections.py`."""
+"""The JSON Schema and the page of all keys, both from `config/schema`.
+
+`python -m bikeped.config.docs docs/configuration.md` writes the page.
+"""
 
 from __future__ import annotations
 
+import ast
+import inspect
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,33 +20,54 @@ from bikeped.files import write_whole
 _INTRO = """\
 # Configuration
 
-<!-- Made by `python -m bikeped.config.docs docs/configuration.md` from the sections in
-     bikeped/config; change the descriptions there. -->
+<!-- Made by `python -m bikeped.config.docs docs/configuration.md` from bikeped/config/schema;
+     change the descriptions there. -->
 
-Every key of `config.yaml`, in the order of the file. A key that is left out has its default; a
-key that is not listed here stops the start with its name and the nearest known one. A key may
-stand only once. `bikeped config check` says what is wrong with a file, `bikeped config show`
-prints the whole effective configuration, and `--set SECTION.KEY=VALUE` on the command line
-overrides one key, for example `--set decision.d_max_m=20 --set feedback.gpio.red=12`.
+Every key of `config.yaml`, in the order of the file. A key that is left out has its default. An
+unknown key is an error that names the nearest known one, and so is a key that is given twice.
+`bikeped config check` reports what is wrong with a file, `bikeped config show` prints the whole
+effective configuration, and `--set SECTION.KEY=VALUE` on the command line overrides one key, for
+example `--set decision.d_max_m=20 --set feedback.gpio.red=12`.
 
 **Frames and seconds.** `decision.memory_frames`, `decision.lookback_frames`,
 `tracking.speed_window_frames` and `latency.frames` count nominal frames, as the paper gives them.
 They become seconds once, at the start, by `decision.nominal_fps`: with `memory_frames: 58` and
 30 frames per second a cyclist is remembered 1.93 s, also when the camera delivers 25 frames per
-second or drops some. `tracking.history_frames` and `feedback.recover_frames` count the frames that
-really come. Keys that end in `_s` are seconds; `_m` metres, `_px` pixels, `_deg` degrees, `_mps`
+second or drops some. `tracking.history_frames` and `feedback.recover_frames` count the frames
+that arrive. Keys that end in `_s` are seconds; `_m` metres, `_px` pixels, `_deg` degrees, `_mps`
 metres per second.
 
-**Paths.** A relative path starts at the folder of the configuration file, one that is given with
-`--set` at the working directory; `~` is the home directory.
+**Paths.** A relative path starts at the folder of the configuration file, or, given with `--set`,
+at the working directory; `~` is the home directory.
 
-**Numbers.** YAML reads `1e-3` as a word: write `0.001`.
+**Numbers.** YAML reads `1e-3` as text: write `0.001`.
 """
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema of config.yaml, every key with its description."""
+    schema = msgspec.json.schema(Config)
+    for _, section in _sections(Config, ""):
+        properties = schema["$defs"][section.__name__]["properties"]
+        for key, text in key_descriptions(section).items():
+            properties[key]["description"] = text
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def key_descriptions(section: type[msgspec.Struct]) -> dict[str, str]:
+    """What each key of a section means: the text below it in the source."""
+    [tree] = ast.parse(inspect.getsource(section)).body
+    assert isinstance(tree, ast.ClassDef)  # noqa: S101 - for the type checker
+    return {
+        ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
+        for key, text in zip(tree.body, tree.body[1:], strict=False)
+        if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
 
 
 def markdown() -> str:
     """The page: one table a section, nested sections after the one that holds them."""
-    _, parts = msgspec.json.schema_components([Config], ref_template="{name}")
+    parts = json_schema()["$defs"]
     lines = [_INTRO]
     for path, struct in _sections(Config, ""):
         properties = parts[struct.__name__]["properties"]
@@ -81,7 +107,7 @@ def _escaped(cell: str) -> str:
 
 
 def _yaml(value: object) -> str:
-    """A default as one writes it in YAML."""
+    """A default as YAML."""
     if isinstance(value, str):
         return f'"{value}"' if value == "off" or not value else value
     if isinstance(value, (list, tuple)):
@@ -90,7 +116,7 @@ def _yaml(value: object) -> str:
 
 
 def _values(item: dict[str, Any]) -> str:
-    """What a key takes, in words."""
+    """The values that a key takes, in words."""
     if "anyOf" in item:
         return " or ".join(_values(choice) for choice in item["anyOf"])
     if "enum" in item:

@@ -1,9 +1,8 @@
-"""Every key of `config.yaml`: its type, range, default and meaning.
+"""Every key of `config.yaml`: its type, range and default, and below it what it means.
 
-Here camera and detection; `sections_judge` and `sections_output` have the others. The descriptions
-are the source of `docs/configuration.md` and of `bikeped config schema`. Values that the paper
-gives in frames stay in frames here (people know them so) and are turned into seconds once, at
-`decision.nominal_fps`.
+This module has camera and detection; `decision` and `outputs` have the other sections. The texts
+below the keys go into `docs/configuration.md` and `bikeped config schema`. Settings that the paper
+gives in frames stay in frames here and become seconds once, at `decision.nominal_fps`.
 """
 
 from __future__ import annotations
@@ -15,12 +14,7 @@ from msgspec import Meta
 
 from bikeped.config.schema.base import Section
 from bikeped.config.schema.decision import DecisionConfig, LatencyConfig, TrackingConfig
-from bikeped.config.schema.outputs import (
-    AuditConfig,
-    FeedbackConfig,
-    MqttConfig,
-    WebConfig,
-)
+from bikeped.config.schema.outputs import AuditConfig, FeedbackConfig, MqttConfig, WebConfig
 
 # Finite by construction: msgspec refuses NaN only where a bound is given, so every float has one.
 Radial = Annotated[float, Meta(ge=-10, le=10)]
@@ -36,240 +30,110 @@ Projection = Literal[
 
 
 class CameraConfig(Section, frozen=True):
-    """The camera: where pictures come from, its lens, and how it hangs."""
+    """The camera: its source, its lens, and its pose above the ground."""
 
-    source: Annotated[
-        str,
-        Meta(
-            min_length=1,
-            description="V4L2 device, video file, folder of images, or rtsp:// or http:// address",
-        ),
-    ] = "/dev/video0"
-    width: Annotated[
-        int, Meta(ge=16, le=16384, description="sensor width asked of the camera, pixels")
-    ] = 3840
-    height: Annotated[
-        int, Meta(ge=16, le=16384, description="sensor height asked of the camera, pixels")
-    ] = 2160
-    fps: Annotated[
-        float, Meta(ge=1, le=240, description="frame rate asked of the camera, frames per second")
-    ] = 30.0
-    fourcc: Annotated[
-        str,
-        Meta(
-            min_length=4,
-            max_length=4,
-            description="V4L2 pixel format; MJPG is passed undecoded",
-        ),
-    ] = "MJPG"
-    calibration: Annotated[
-        str | None,
-        Meta(
-            description="calibration file with projection, centre, focal length and radial terms, "
-            "relative to this file; null uses only the keys below"
-        ),
-    ] = None
-    projection: Annotated[
-        Projection | None,
-        Meta(
-            description="lens model; linear is equidistant, equalarea is equisolid, perspective is "
-            "an ordinary lens; null takes the calibration's, or else equidistant"
-        ),
-    ] = None
-    fov_deg: Annotated[
-        Annotated[float, Meta(gt=0, le=300)] | None,
-        Meta(description="field of view, degrees; null takes the calibration's"),
-    ] = None
-    radius_px: Annotated[
-        Annotated[float, Meta(gt=0, le=100000)] | None,
-        Meta(
-            description="image circle radius at the edge of the field of view, crop pixels; gives "
-            "the focal length; null takes the calibration's focal length",
-        ),
-    ] = None
-    cx: Annotated[
-        Annotated[float, Meta(ge=-100000, le=100000)] | None,
-        Meta(
-            description="optical centre u in the crop, pixels; null takes the calibration's, or "
-            "else the middle",
-        ),
-    ] = None
-    cy: Annotated[
-        Annotated[float, Meta(ge=-100000, le=100000)] | None,
-        Meta(
-            description="optical centre v in the crop, pixels; null takes the calibration's, or "
-            "else the middle",
-        ),
-    ] = None
-    k1: Annotated[Radial | None, Meta(description="radial term of theta^3; null: calibration")] = (
-        None
-    )
-    k2: Annotated[Radial | None, Meta(description="radial term of theta^5; null: calibration")] = (
-        None
-    )
-    k3: Annotated[Radial | None, Meta(description="radial term of theta^7; null: calibration")] = (
-        None
-    )
-    k4: Annotated[Radial | None, Meta(description="radial term of theta^9; null: calibration")] = (
-        None
-    )
-    pad_size: Annotated[
-        Annotated[int, Meta(ge=16, le=32768)] | None,
-        Meta(
-            description="side of the black square that the frame is centred in, pixels; null: none",
-        ),
-    ] = 3840
-    crop_size: Annotated[
-        Annotated[int, Meta(ge=16, le=32768)] | None,
-        Meta(
-            description="side of the square cut from its middle, pixels; null: none",
-        ),
-    ] = 3500
-    height_m: Annotated[
-        float, Meta(gt=0, le=100, description="height of the lens above the ground, metres")
-    ] = 3.6576
-    pitch_deg: Annotated[
-        float,
-        Meta(ge=-90, le=90, description="pitch, degrees; 0 is level, negative looks down"),
-    ] = 0.0
-    heading_deg: Annotated[
-        float,
-        Meta(
-            ge=-360,
-            le=360,
-            description="turns the ground frame to the right of the optical axis, degrees; 0 keeps "
-            "x forward",
-        ),
-    ] = 0.0
-    table_step_px: Annotated[
-        int,
-        Meta(ge=2, le=64, description="spacing of the ground table's lattice, crop pixels"),
-    ] = 8
-    stale_after_s: Annotated[
-        float,
-        Meta(
-            gt=0, le=60, description="no frame for this long is a FAULT and a new capture, seconds"
-        ),
-    ] = 0.5
-    hang_after_s: Annotated[
-        float,
-        Meta(
-            ge=1,
-            le=600,
-            description="a read that has not returned for this long ends the process, so that "
-            "systemd starts a fresh one, seconds",
-        ),
-    ] = 15.0
+    source: Annotated[str, Meta(min_length=1)] = "/dev/video0"
+    """V4L2 device, video file, folder of images, or rtsp:// or http:// address"""
+    width: Annotated[int, Meta(ge=16, le=16384)] = 3840
+    """sensor width requested from the camera, pixels"""
+    height: Annotated[int, Meta(ge=16, le=16384)] = 2160
+    """sensor height requested from the camera, pixels"""
+    fps: Annotated[float, Meta(ge=1, le=240)] = 30.0
+    """frame rate requested from the camera, frames per second"""
+    fourcc: Annotated[str, Meta(min_length=4, max_length=4)] = "MJPG"
+    """V4L2 pixel format; MJPG is passed undecoded"""
+    calibration: str | None = None
+    """calibration file with projection, centre, focal length and radial terms, relative to this
+    file; null uses only the keys below"""
+    projection: Projection | None = None
+    """lens model; linear is equidistant, equalarea is equisolid, perspective is an ordinary lens;
+    null takes the calibration's, or else equidistant"""
+    fov_deg: Annotated[float, Meta(gt=0, le=300)] | None = None
+    """field of view, degrees; null takes the calibration's"""
+    radius_px: Annotated[float, Meta(gt=0, le=100000)] | None = None
+    """image circle radius at the edge of the field of view, crop pixels; gives the focal length;
+    null takes the calibration's focal length"""
+    cx: Annotated[float, Meta(ge=-100000, le=100000)] | None = None
+    """optical centre u in the crop, pixels; null takes the calibration's, or else the middle"""
+    cy: Annotated[float, Meta(ge=-100000, le=100000)] | None = None
+    """optical centre v in the crop, pixels; null takes the calibration's, or else the middle"""
+    k1: Radial | None = None
+    """radial term of theta^3; null: calibration"""
+    k2: Radial | None = None
+    """radial term of theta^5; null: calibration"""
+    k3: Radial | None = None
+    """radial term of theta^7; null: calibration"""
+    k4: Radial | None = None
+    """radial term of theta^9; null: calibration"""
+    pad_size: Annotated[int, Meta(ge=16, le=32768)] | None = 3840
+    """side of the black square that the frame is centred in, pixels; null: none"""
+    crop_size: Annotated[int, Meta(ge=16, le=32768)] | None = 3500
+    """side of the square cut from its middle, pixels; null: none"""
+    height_m: Annotated[float, Meta(gt=0, le=100)] = 3.6576
+    """height of the lens above the ground, metres"""
+    pitch_deg: Annotated[float, Meta(ge=-90, le=90)] = 0.0
+    """pitch, degrees; 0 is level, negative looks down"""
+    heading_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    """turns the ground frame to the right of the optical axis, degrees; 0 keeps x forward"""
+    table_step_px: Annotated[int, Meta(ge=2, le=64)] = 8
+    """spacing of the ground table's lattice, crop pixels"""
+    stale_after_s: Annotated[float, Meta(gt=0, le=60)] = 0.5
+    """no frame for this long is a FAULT and a new capture, seconds"""
+    hang_after_s: Annotated[float, Meta(ge=1, le=600)] = 15.0
+    """a read that has not returned for this long ends the process, and systemd starts it again,
+    seconds"""
 
 
 class DetectionConfig(Section, frozen=True):
-    """The detector: the model file, its layout, and what is kept of its answer."""
+    """The detector: model file, output layout, and which detections are kept."""
 
-    model: Annotated[
-        str | None,
-        Meta(
-            description="model file, .onnx or .engine, relative to this file; bundled: the small "
-            "one that comes with bikeped, which knows drawn streets only and is for demo and "
-            "self-test, never for a street; null: none"
-        ),
-    ] = None
-    sha256: Annotated[
-        Annotated[str, Meta(pattern="^[0-9a-fA-F]{64}$")] | None,
-        Meta(
-            description="SHA-256 of the model file, refused when different; null: any",
-        ),
-    ] = None
-    layout: Annotated[
-        Literal["auto", "yolov5", "yolov8", "end2end", "yolox", "yolox-decoded"],
-        Meta(
-            description="output layout: yolov5 also v7; yolov8 also v9, v11, v12; end2end also v10 "
-            "and 26; auto tells them apart by metadata and shapes"
-        ),
-    ] = "auto"
-    preprocess: Annotated[
-        Literal["auto", "ultralytics", "yolox", "yolox-legacy"],
-        Meta(
-            description="ultralytics: RGB/255, centred letterbox; yolox: BGR 0..255, top-left; "
-            "yolox-legacy (before 0.1.1): RGB/255, ImageNet mean and deviation, top-left"
-        ),
-    ] = "auto"
-    region: Annotated[
-        Literal["auto", "road", "frame"],
-        Meta(
-            description="what is shown to the model; road: the part where road users within "
-            "decision.max_range_m can be, by height and pitch of the camera; frame: all; auto: "
-            "road where the model's input can be of that height, which is quicker, else frame"
-        ),
-    ] = "auto"
-    confidence: Annotated[
-        float, Meta(ge=0.001, le=1, description="smallest confidence that is kept")
-    ] = 0.1
-    iou: Annotated[
-        float,
-        Meta(ge=0.01, le=1, description="overlap above which the weaker of one class is dropped"),
-    ] = 0.45
-    merge_overlap: Annotated[
-        float,
-        Meta(
-            ge=0.5,
-            le=1,
-            description="a box that is kept becomes the mean, weighted by confidence, of those of "
-            "its kind that overlap it this much, which trembles less; 1 leaves every box as it is",
-        ),
-    ] = 0.75
-    max_detections: Annotated[
-        int, Meta(ge=1, le=10000, description="most detections kept of one frame")
-    ] = 300
-    pedestrian: Annotated[
-        tuple[str, ...], Meta(description="model class names that are pedestrians")
-    ] = ("person", "pedestrian")
-    cyclist: Annotated[tuple[str, ...], Meta(description="model class names that are cyclists")] = (
-        "bicycle",
-        "motorcycle",
-        "cyclist",
+    model: str | None = None
+    """model file, .onnx or .engine, relative to this file; bundled: the small one that comes with
+    bikeped, trained on drawn streets only, for demo and self-test, never for a street; null:
+    none"""
+    sha256: Annotated[str, Meta(pattern="^[0-9a-fA-F]{64}$")] | None = None
+    """SHA-256 of the model file, refused when different; null: any"""
+    layout: Literal["auto", "yolov5", "yolov8", "end2end", "yolox", "yolox-decoded"] = "auto"
+    """output layout: yolov5 also v7; yolov8 also v9, v11, v12; end2end also v10 and 26; auto tells
+    them apart by metadata and shapes"""
+    preprocess: Literal["auto", "ultralytics", "yolox", "yolox-legacy"] = "auto"
+    """ultralytics: RGB/255, centred letterbox; yolox: BGR 0..255, top-left; yolox-legacy (before
+    0.1.1): RGB/255, ImageNet mean and deviation, top-left"""
+    region: Literal["auto", "road", "frame"] = "auto"
+    """part of the frame that the model gets; road: where road users within decision.max_range_m can
+    be, by height and pitch of the camera; frame: all; auto: road where the model's input can have
+    that height, which is faster, else frame"""
+    confidence: Annotated[float, Meta(ge=0.001, le=1)] = 0.1
+    """lowest confidence of a detection that is kept"""
+    iou: Annotated[float, Meta(ge=0.01, le=1)] = 0.45
+    """overlap above which the less confident of two boxes of one class is dropped"""
+    merge_overlap: Annotated[float, Meta(ge=0.5, le=1)] = 0.75
+    """box voting: a kept box becomes the mean, weighted by confidence, of the boxes of its kind
+    that overlap it this much, which reduces box jitter; 1 leaves every box as it is"""
+    max_detections: Annotated[int, Meta(ge=1, le=10000)] = 300
+    """largest number of detections kept of one frame"""
+    pedestrian: tuple[str, ...] = ("person", "pedestrian")
+    """model class names that are pedestrians"""
+    cyclist: tuple[str, ...] = ("bicycle", "motorcycle", "cyclist")
+    """model class names that are cyclists"""
+    vehicle: tuple[str, ...] = ("car", "bus", "truck", "vehicle")
+    """model class names that are vehicles"""
+    rider_overlap: Annotated[float, Meta(ge=0, le=1)] = 0.4
+    """share of a person's box, from the waist down, that a cyclist's box must cover for the two to
+    be one rider; 1 never joins them"""
+    providers: Annotated[tuple[Literal["tensorrt", "cuda", "cpu"], ...], Meta(min_length=1)] = (
+        "tensorrt",
+        "cuda",
+        "cpu",
     )
-    vehicle: Annotated[tuple[str, ...], Meta(description="model class names that are vehicles")] = (
-        "car",
-        "bus",
-        "truck",
-        "vehicle",
-    )
-    rider_overlap: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=1,
-            description="share of a person's box, from the waist down, that a cyclist's box must "
-            "cover for the two to be one rider; 1 never joins them",
-        ),
-    ] = 0.4
-    providers: Annotated[
-        tuple[Literal["tensorrt", "cuda", "cpu"], ...],
-        Meta(
-            min_length=1,
-            description="ONNX Runtime execution providers in order; those not present are skipped",
-        ),
-    ] = ("tensorrt", "cuda", "cpu")
-    engine_cache: Annotated[
-        str, Meta(min_length=1, description="folder for TensorRT engines built from ONNX")
-    ] = "~/.cache/bikeped/engines"
-    threads: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=256,
-            description="CPU threads for inference; 0 lets the runtime choose, and lets a "
-            "recording be looked at by two copies of the model with half of the cores each",
-        ),
-    ] = 0
-    silent_after_s: Annotated[
-        float,
-        Meta(
-            gt=0,
-            le=60,
-            description="no detector answer for this long is a FAULT, seconds",
-        ),
-    ] = 0.5
+    """ONNX Runtime execution providers in order; those not present are skipped"""
+    engine_cache: Annotated[str, Meta(min_length=1)] = "~/.cache/bikeped/engines"
+    """folder for TensorRT engines built from ONNX"""
+    threads: Annotated[int, Meta(ge=0, le=256)] = 0
+    """CPU threads for inference; 0 lets the runtime choose, and runs two copies of the model with
+    half of the cores each on a recording"""
+    silent_after_s: Annotated[float, Meta(gt=0, le=60)] = 0.5
+    """no detector answer for this long is a FAULT, seconds"""
 
 
 class Config(Section, frozen=True):
