@@ -1,4 +1,4 @@
-"""The look that all figures share: sheets with a title and a plain caption, colours, saving.
+"""What all figures share: sheets with title and caption, colours, labels, bars, saving.
 
 Colours are Okabe and Ito's, told apart with every common colour blindness; beside them every
 series has its own marker, dash or hatch, so that a grey print reads the same.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -23,13 +23,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-BLACK, GREY, LIGHT = "#1a1a1a", "#6b6b6b", "#d9d9d9"
+BLACK, DARK, GREY, LIGHT = "#1a1a1a", "#3d3d3d", "#6b6b6b", "#d9d9d9"
 BLUE, SKY, GREEN = "#0072b2", "#56b4e9", "#009e73"
 ORANGE, RED, PURPLE = "#e69f00", "#d55e00", "#cc79a7"
 #: A line's dash as matplotlib takes it: a name, or an offset with lengths on and off.
 Dash: TypeAlias = "str | tuple[int, tuple[int, ...]]"
-#: One look a series, in order: colour, marker, dash.
-SERIES: tuple[tuple[str, str, Dash], ...] = (
+#: How a series is drawn: colour, marker, dash.
+SeriesStyle: TypeAlias = "tuple[str, str, Dash]"
+#: The styles of a figure's series, in order.
+SERIES: tuple[SeriesStyle, ...] = (
     (BLUE, "o", "-"),
     (RED, "s", "--"),
     (GREEN, "^", "-."),
@@ -128,7 +130,7 @@ class FigureSheet:
             escape_dollars("\n".join(lines)),
             fontsize=_CAPTION_PT,
             va="bottom",
-            color="#3d3d3d",
+            color=DARK,
             linespacing=1.3,
         )
         grid = self.figure.subplots(rows, columns, squeeze=False, **subplots)
@@ -158,6 +160,18 @@ class FigureSheet:
         )
         found.set_in_layout(False)
 
+    def label_rows(self, labels: Sequence[str], top: float = -0.5) -> None:
+        """Names the rows 0, 1, ... of horizontal bars or points, the first on top."""
+        self.axes[0].set_yticks(range(len(labels)), [escape_dollars(text) for text in labels])
+        self.axes[0].set_ylim(len(labels) - 1 - top, top)
+        for axes in self.axes:
+            hide_y_lines(axes)
+
+    def colour_bar(self, image: Any, label: str, extend: str, **place: Any) -> None:
+        """A bar beside all panels that explains an image's colours."""
+        bar = self.figure.colorbar(image, ax=self.axes, label=label, extend=extend, **place)
+        bar.outline.set_visible(False)  # type: ignore[operator]
+
     def save(self, folder: Path, stem: str) -> list[Path]:
         """PNG and PDF of the sheet; the same drawing gives the same bytes, for dates are left out.
 
@@ -174,6 +188,38 @@ class FigureSheet:
             write_whole(path, data.getvalue())
             paths.append(path)
         return paths
+
+
+def label(
+    axes: Axes, text: str, at: tuple[Any, Any], offset: tuple[float, float] = (0, 0), **style: Any
+) -> None:
+    """Small text at `at`, moved by `offset` in points."""
+    style = {"fontsize": 8, **style}
+    axes.annotate(text, at, offset, textcoords="offset points", **style)
+
+
+def plot_series(axes: Axes, x: Any, y: Any, style: SeriesStyle, **more: Any) -> None:
+    """A line with markers in one of the styles of `SERIES`."""
+    colour, marker, dash = style
+    axes.plot(x, y, color=colour, marker=marker, linestyle=dash, **more)
+
+
+def fill(colour: str, hatch: str = "") -> dict[str, Any]:
+    """Keywords of a bar or patch without edges."""
+    return {"facecolor": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0}
+
+
+def hide_y_lines(axes: Axes) -> None:
+    """No grid lines and tick marks at the rows of a vertical axis of names."""
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", length=0)
+
+
+def means_and_arms(summaries: Iterable[Mapping[str, Any]]) -> tuple[FloatArray, FloatArray]:
+    """Means [n] in per cent, and the interval's arms [2, n]: 0 where there is no interval."""
+    rows = list(summaries)
+    mean, low, high = (to_percents(row.get(key) for row in rows) for key in ("mean", "low", "high"))
+    return mean, np.nan_to_num(np.maximum(np.stack([mean - low, high - mean]), 0.0))
 
 
 def escape_dollars(text: str) -> str:

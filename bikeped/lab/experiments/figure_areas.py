@@ -1,4 +1,4 @@
-"""Figures made of bars and maps: budgets, deployment, placement, braking, the map of errors."""
+"""Bar charts and maps: budgets, deployment, placement, braking, the map of errors."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from bikeped.lab.plotting import (
     SKY,
     FigureSheet,
     escape_dollars,
+    fill,
+    label,
+    means_and_arms,
     to_floats,
     to_percents,
 )
@@ -25,9 +28,9 @@ from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S
 from bikeped.types import FloatArray
 
 Data = Mapping[str, Any]
-#: Pairs farther from the camera are not judged, m (definitions, section 8).
+#: Pairs farther from the camera are not evaluated, m (definitions, section 8).
 MAX_RANGE_M = 25.0
-#: Colour, hatch and words of a budget's class.
+#: Colour, hatch and legend of a budget's class.
 _CLASSES = {
     "above distracted": (GREEN, "", f"above {PEDESTRIAN_PRT_S:g} s: even a distracted person"),
     "above attentive": (ORANGE, "///", f"above {ATTENTIVE_PRT_S:g} s: an attentive person only"),
@@ -45,39 +48,20 @@ def budgets(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
         axes = sheet.axes[0]
         for y, row in enumerate(rows):
             colour, hatch, _ = _CLASSES.get(row["class"], (GREY, "", row["class"]))
-            mean = 0.0 if row["mean"] is None else row["mean"]
-            axes.barh(
-                y, mean, 0.72, color=colour, hatch=hatch, edgecolor="white", linewidth=0, zorder=2
-            )
+            axes.barh(y, row["mean"] or 0.0, 0.72, zorder=2, **fill(colour, hatch))
             if row["mean"] is None:
-                axes.annotate(
-                    "no alert with a budget",
-                    (0, y),
-                    (4, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=8,
-                )
-            axes.plot(
-                row["onsets"],
-                [y] * len(row["onsets"]),
-                "|",
-                color=BLACK,
-                markersize=10,
-                markeredgewidth=1.6,
-                zorder=3,
-            )
+                label(axes, "no alert with a budget", (0, y), (4, 0), va="center")
+            at = [y] * len(row["onsets"])
+            ticks: dict[str, Any] = {"markersize": 10, "markeredgewidth": 1.6, "zorder": 3}
+            axes.plot(row["onsets"], at, "|", color=BLACK, **ticks)
         for value, dash in ((PEDESTRIAN_PRT_S, "-"), (ATTENTIVE_PRT_S, "--")):
             axes.axvline(value, color=BLACK, linewidth=1.1, linestyle=dash, zorder=4)
-        axes.set_yticks(range(len(rows)), [escape_dollars(r["scenario"]) for r in rows])
-        axes.set_ylim(len(rows) - 0.4, -0.6)
+        sheet.label_rows([r["scenario"] for r in rows], -0.6)
         axes.set_xlim(0, None)
-        axes.tick_params(axis="y", length=0)
-        axes.grid(visible=False, axis="y")
         axes.set_xlabel("warning budget, s (from the alert to the closest approach)")
         present = {r["class"] for r in rows}
         handles: list[Any] = [
-            Patch(facecolor=c, hatch=h, edgecolor="white", linewidth=0, label=text)
+            Patch(label=text, **fill(c, h))
             for key, (c, h, text) in _CLASSES.items()
             if key in present
         ]
@@ -94,7 +78,7 @@ def deployment(data: Data, title: str, caption: str, folder: Path) -> list[Path]
     """Bars of the sensitivity by road width, one camera and two, for each mount."""
     rows = data["rows"]
     mounts = list(dict.fromkeys((r["height_m"], r["pitch_deg"]) for r in rows))
-    looks = {1: (SKY, "///"), 2: (BLUE, "")}
+    styles = {1: (SKY, "///"), 2: (BLUE, "")}
     with FigureSheet(title, caption, 7.0, 3.2, 1, len(mounts), 1, sharey=True) as sheet:
         for axes, (height, pitch) in zip(sheet.axes, mounts, strict=True):
             part = [r for r in rows if (r["height_m"], r["pitch_deg"]) == (height, pitch)]
@@ -103,47 +87,20 @@ def deployment(data: Data, title: str, caption: str, folder: Path) -> list[Path]
             for number, cameras in enumerate(counts):
                 found = {r["width_ft"]: r for r in part if r["cameras"] == cameras}
                 x = np.arange(len(widths)) + (number - (len(counts) - 1) / 2) * 0.4
-                sens = [found[w]["sensitivity"] if w in found else {} for w in widths]
-                mean, low, high = (
-                    to_percents(s.get(k) for s in sens) for k in ("mean", "low", "high")
-                )
-                colour, hatch = looks.get(cameras, (GREY, ".."))
-                axes.bar(
-                    x,
-                    mean,
-                    0.38,
-                    color=colour,
-                    hatch=hatch,
-                    edgecolor="white",
-                    linewidth=0,
-                    label=f"{cameras} camera{'s' if cameras != 1 else ''}",
-                )
-                arms = np.nan_to_num(np.maximum(np.stack([mean - low, high - mean]), 0.0))
+                rows_by_width = [found.get(w, {}) for w in widths]
+                mean, arms = means_and_arms(r.get("sensitivity", {}) for r in rows_by_width)
+                name = f"{cameras} camera{'s' if cameras != 1 else ''}"
+                axes.bar(x, mean, 0.38, label=name, **fill(*styles.get(cameras, (GREY, ".."))))
                 axes.errorbar(x, mean, yerr=arms, fmt="none", color=BLACK, capsize=3, linewidth=1.2)
                 for place, value, arm in zip(x, mean, arms[1], strict=True):
-                    axes.annotate(
-                        f"{value:.0f}",
-                        (place, value + arm),
-                        (0, 2),
-                        textcoords="offset points",
-                        ha="center",
-                        fontsize=8,
-                    )
-                seen = [
-                    found[w].get("visible_only", {}).get("sensitivity", {}) if w in found else {}
-                    for w in widths
-                ]
-                lower = to_percents(s.get("mean") for s in seen)
+                    label(axes, f"{value:.0f}", (place, value + arm), (0, 2), ha="center")
+                lower, _ = means_and_arms(
+                    r.get("visible_only", {}).get("sensitivity", {}) for r in rows_by_width
+                )
                 if np.isfinite(lower).any():
-                    axes.plot(
-                        x,
-                        lower,
-                        "_",
-                        color=BLACK,
-                        markersize=13,
-                        markeredgewidth=2,
-                        label="if nobody unseen is detected" if number == 0 else None,
-                    )
+                    name = "if objects out of sight are never detected"
+                    dash: dict[str, Any] = {"markersize": 13, "markeredgewidth": 2}
+                    axes.plot(x, lower, "_", color=BLACK, label=None if number else name, **dash)
             axes.set_title(f"{height:g} m high, pitch {pitch:g}°")
             axes.set_xticks(range(len(widths)), [f"{w:g}" for w in widths])
             axes.set_xlabel("road width, ft")
@@ -155,12 +112,12 @@ def deployment(data: Data, title: str, caption: str, folder: Path) -> list[Path]
 
 
 def placement(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
-    """Sensitivity by height and pitch; beside it, when known, with the unseen left undetected."""
+    """Sensitivity by height and pitch; beside it, when known, with objects out of sight missed."""
     grids = {"": np.stack([to_percents(row) for row in data["sensitivity"]])}
     if "visible_only_sensitivity" in data:
         other = np.stack([to_percents(row) for row in data["visible_only_sensitivity"]])
         if not np.allclose(other, grids[""], atol=0.05, equal_nan=True):
-            grids = {"as the paper counts": grids[""], "if nobody unseen is detected": other}
+            grids = {"as the paper counts": grids[""], "objects out of sight never detected": other}
     heights, pitches = data["height_m"], data["pitch_deg"]
     values = np.concatenate([g[np.isfinite(g)] for g in grids.values()])
     # A few cells that see nothing must not take the scale from the others.
@@ -174,15 +131,9 @@ def placement(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
                 grid, origin="lower", aspect="auto", cmap="cividis", vmin=low, vmax=high
             )
             for (i, j), value in np.ndenumerate(grid):
-                axes.text(
-                    j,
-                    i,
-                    "-" if np.isnan(value) else f"{value:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=7,
-                    color="white" if value < (low + high) / 2 else BLACK,
-                )
+                text = "-" if np.isnan(value) else f"{value:.0f}"
+                colour = "white" if value < (low + high) / 2 else BLACK
+                axes.text(j, i, text, ha="center", va="center", fontsize=7, color=colour)
             axes.set_xticks(range(len(pitches)), [f"{p + 0.0:g}" for p in pitches])
             axes.set_yticks(range(len(heights)), [f"{h:g}" for h in heights])
             axes.grid(visible=False)
@@ -191,10 +142,7 @@ def placement(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
             axes.set_title(name)
         sheet.axes[0].set_ylabel("camera height, m")
         if image is not None:
-            bar = sheet.figure.colorbar(
-                image, ax=sheet.axes, label="sensitivity, %", extend="min", pad=0.015
-            )
-            bar.outline.set_visible(False)  # type: ignore[operator]
+            sheet.colour_bar(image, "sensitivity, %", "min", pad=0.015)
         return sheet.save(folder, "placement")
 
 
@@ -213,38 +161,18 @@ def braking(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     )
     rows = data["rows"]
     with FigureSheet(title, caption, 7.0, 0.36 * len(rows) + 1.0, 1, 3, sharey=True) as sheet:
-        for axes, (key, label, colour, hatch) in zip(sheet.axes, panels, strict=True):
+        for axes, (key, text, colour, hatch) in zip(sheet.axes, panels, strict=True):
             values = to_percents(r["metrics"].get(key) for r in rows)
-            axes.barh(
-                range(len(rows)),
-                np.nan_to_num(values),
-                0.66,
-                color=colour,
-                hatch=hatch,
-                edgecolor="white",
-                linewidth=0,
-            )
+            axes.barh(range(len(rows)), np.nan_to_num(values), 0.66, **fill(colour, hatch))
             room = 100.0 if np.nanmax(values) > 50 else float(np.nanmax(values)) * 1.1 + 1
             for y, value in enumerate(values):
-                axes.annotate(
-                    "-" if np.isnan(value) else f"{value:.1f}",
-                    (np.nan_to_num(value), y),
-                    (3, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=8,
-                )
+                number = "-" if np.isnan(value) else f"{value:.1f}"
+                label(axes, number, (np.nan_to_num(value), y), (3, 0), va="center")
             axes.set_xlim(0, room * 1.22)
             if room == 100.0:
                 axes.set_xticks(range(0, 101, 25))
-            axes.set_xlabel(label)
-            axes.grid(visible=False, axis="y")
-            axes.tick_params(axis="y", length=0)
-        first = sheet.axes[0]
-        first.set_yticks(
-            range(len(rows)), [escape_dollars(words.get(r["profile"], r["profile"])) for r in rows]
-        )
-        first.set_ylim(len(rows) - 0.5, -0.5)
+            axes.set_xlabel(text)
+        sheet.label_rows([words.get(r["profile"], r["profile"]) for r in rows])
         return sheet.save(folder, "braking")
 
 
@@ -264,7 +192,7 @@ def error_map(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
             # Beyond the range of decisions nothing is used.
             distance = np.hypot(*np.meshgrid(x, y, indexing="ij"))
             beyond, near = distance > MAX_RANGE_M + 1, distance < 5
-            # Close by, where objects are cut by the picture's edge, lines would only be scribbles.
+            # Close by, objects are cut by the image's edge and contours would be noise.
             calm = np.where(beyond | near, np.nan, error)
             image = axes.pcolormesh(
                 y, x, error, cmap="cividis", vmin=0, vmax=limit, rasterized=True
@@ -282,8 +210,5 @@ def error_map(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
             axes.set_xlim(-25.5, 25.5)
         sheet.axes[-1].set_xlabel("to the right of the camera, m")
         if image is not None:
-            bar = sheet.figure.colorbar(
-                image, ax=sheet.axes, label="localisation error, m", extend="max", shrink=0.6
-            )
-            bar.outline.set_visible(False)  # type: ignore[operator]
+            sheet.colour_bar(image, "localisation error, m", "max", shrink=0.6)
         return sheet.save(folder, "errors_map")

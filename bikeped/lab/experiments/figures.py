@@ -1,4 +1,4 @@
-"""All figures of a set of experiments, each with its caption and what it says in plain words."""
+"""All figures of the experiments, each with its caption and a plain explanation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.errors import BikepedError, require
+from bikeped.errors import require
+from bikeped.files import make_folder
 from bikeped.lab.experiments import figure_areas, figure_lines
 from bikeped.lab.simulation.suite import Suite
 
@@ -15,12 +16,13 @@ Draw = Callable[[Mapping[str, Any], str, str, Path], list[Path]]
 
 
 @dataclass(frozen=True)
-class FigureText:
-    """Words of a figure: `caption` is printed on it, `explained` are two sentences for the report.
+class ReportFigure:
+    """One figure and its texts: `caption` is printed on it, `explained` is for the report.
 
     `experiment` names the data that it is drawn from, `needs` the key in them that it shows.
     """
 
+    draw: Draw
     experiment: str
     needs: str
     title: str
@@ -28,19 +30,21 @@ class FigureText:
     explained: str
 
 
-#: By file name without ending, in the order of the report.
-FIGURES: dict[str, FigureText] = {
-    "compare": FigureText(
+#: By file stem, in the order of the report.
+FIGURES: dict[str, ReportFigure] = {
+    "compare": ReportFigure(
+        figure_lines.compare,
         "compare",
         "configurations",
-        "Which configuration finds danger, and which cries wolf?",
+        "Which configuration detects danger, and which alerts without danger?",
         "Up: more of the actionable danger is answered with an alert. Right: fewer alerts "
         "without danger. Filled marks include the camera's localisation error.",
         "Each mark is one way to set up the decision: the further up, the more danger it "
         "answers, the further right, the less often it alerts for nothing. Only what lies in "
         "the grey corner passes the two gates that a deployment needs.",
     ),
-    "budgets": FigureText(
+    "budgets": ReportFigure(
+        figure_areas.budgets,
         "budgets",
         "rows",
         "How much time does an alert leave?",
@@ -50,7 +54,8 @@ FIGURES: dict[str, FigureText] = {
         "nearest, compared with how long people take to react. A hatched bar holds at least one"
         " alert that leaves a distracted person too little time.",
     ),
-    "latency": FigureText(
+    "latency": ReportFigure(
+        figure_lines.latency,
         "latency",
         "delay_ms",
         "What does a slow camera cost?",
@@ -60,8 +65,9 @@ FIGURES: dict[str, FigureText] = {
         " curves show what this costs, and whether predicting where people are by now makes up "
         "for it.",
     ),
-    "loss_latency": FigureText(
-        "loss_latency",
+    "loss_latency": ReportFigure(
+        figure_lines.loss_latency,
+        "latency_loss",
         "predictors",
         "A slow camera that also misses people",
         "Late pictures and missed detections together. Bands: 95 % confidence interval of the "
@@ -69,7 +75,8 @@ FIGURES: dict[str, FigureText] = {
         "As before, but the detector also misses people at random, as real ones do. Where the "
         "bands of two predictors overlap, their difference may be chance.",
     ),
-    "montecarlo": FigureText(
+    "montecarlo": ReportFigure(
+        figure_lines.montecarlo,
         "montecarlo",
         "rows",
         "How well does it do when the detector misses people?",
@@ -78,36 +85,39 @@ FIGURES: dict[str, FigureText] = {
         "Detectors miss people; here each person is missed at random as often as was measured, "
         "either frame by frame or several frames in a row. Whiskers show how sure the mean is.",
     ),
-    "truth": FigureText(
+    "truth": ReportFigure(
+        figure_lines.truth,
         "truth",
         "rows",
-        "Do the results hang on where we draw the line?",
+        "Do the results depend on the ground-truth thresholds?",
         "One threshold of the definition of danger is varied at a time; filled marks are the "
         "default. SevFN: share of missed danger, weighted by the cyclist's energy.",
         "What counts as danger is a choice, and these are its three thresholds, each moved in "
-        "turn. If the marks of a group lie close together, the result does not hang on that "
+        "turn. If the marks of a group lie close together, the result does not depend on that "
         "choice.",
     ),
-    "braking": FigureText(
+    "braking": ReportFigure(
+        figure_areas.braking,
         "braking",
         "rows",
-        "Do the results hang on how cyclists brake?",
-        "The same decisions, judged as if every cyclist braked in one way (reaction time, "
-        "deceleration).",
+        "Do the results depend on how cyclists brake?",
+        "The same decisions against ground truth in which every cyclist brakes in one way "
+        "(reaction time, deceleration).",
         "How soon a cyclist can stop decides what counts as danger. The bars repeat the "
-        "judgement with other reaction times and brakes; the decisions themselves stay the "
-        "same.",
+        "comparison with other reaction times and brakes; the decisions stay the same.",
     ),
-    "errors": FigureText(
+    "errors": ReportFigure(
+        figure_lines.error_lines,
         "errors",
         "table",
         "How far off is a position?",
         "Distance between where an object stands and where the camera puts it, by how far it is"
         " and how far it is aside of the camera's axis.",
-        "The camera takes the middle of a box's lower edge for the point where somebody stands,"
+        "The camera takes the middle of a box's lower edge for the point where a person stands,"
         " and that is a little wrong. Long objects at the edge of the view are off most.",
     ),
-    "errors_map": FigureText(
+    "errors_map": ReportFigure(
+        figure_areas.error_map,
         "errors",
         "map",
         "Where on the ground is a position off?",
@@ -117,16 +127,18 @@ FIGURES: dict[str, FigureText] = {
         "decisions are made. Dark is good: positions there are right to within a few "
         "decimetres.",
     ),
-    "deployment": FigureText(
+    "deployment": ReportFigure(
+        figure_areas.deployment,
         "deployment",
         "rows",
         "One camera or two, on narrow and wide roads",
         "Mean sensitivity over random trials with its 95 % confidence interval; black dashes: "
-        "the same if whoever no camera can see is never detected.",
+        "the same if objects that no camera sees are never detected.",
         "A second camera on the other side sees whom the first one misses. Bars compare the two"
         " for usual road widths and two ways to mount a camera.",
     ),
-    "placement": FigureText(
+    "placement": ReportFigure(
+        figure_areas.placement,
         "placement",
         "sensitivity",
         "How high to mount the camera, and how steep?",
@@ -135,7 +147,8 @@ FIGURES: dict[str, FigureText] = {
         "is darker, the mount looks good on the left only because people were detected whom the"
         " camera cannot see.",
     ),
-    "optimize": FigureText(
+    "optimize": ReportFigure(
+        figure_lines.optimize,
         "optimize",
         "trace",
         "How the parameters were found",
@@ -145,22 +158,6 @@ FIGURES: dict[str, FigureText] = {
         "help.",
     ),
 }
-_DRAW: dict[str, Draw] = {
-    "compare": figure_lines.compare,
-    "budgets": figure_areas.budgets,
-    "latency": figure_lines.latency,
-    "loss_latency": figure_lines.loss_latency,
-    "montecarlo": figure_lines.montecarlo,
-    "truth": figure_lines.truth,
-    "braking": figure_areas.braking,
-    "errors": figure_lines.error_lines,
-    "errors_map": figure_areas.error_map,
-    "deployment": figure_areas.deployment,
-    "placement": figure_areas.placement,
-    "optimize": figure_lines.optimize,
-}
-#: Other names by which experiments may come.
-_ALIASES = {"loss_latency": "latency_loss"}
 
 
 def draw_all(data: Mapping[str, Mapping[str, Any]], suite: Suite, folder: Path) -> list[Path]:
@@ -170,19 +167,18 @@ def draw_all(data: Mapping[str, Mapping[str, Any]], suite: Suite, folder: Path) 
     cannot be written.
     """
     require("matplotlib")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BikepedError(
-            f"{folder}: cannot be made ({error.strerror}); choose another folder"
-        ) from error
+    make_folder(folder)
     paths: list[Path] = []
-    for stem, text in FIGURES.items():
-        found = data.get(text.experiment, data.get(_ALIASES.get(text.experiment, "")))
-        if not found or not found.get(text.needs):
+    for figure in FIGURES.values():
+        found = data.get(figure.experiment)
+        if not found or not found.get(figure.needs):
             continue
-        caption = f"{text.caption} On {len(suite.scenarios)} scenarios."
-        if text.experiment in ("errors", "deployment", "placement"):
-            caption = text.caption  # made with single objects or roads of their own
-        paths += _DRAW[stem](found, text.title, caption, folder)
+        caption = figure.caption
+        if figure.experiment not in (
+            "errors",
+            "deployment",
+            "placement",
+        ):  # with own objects, roads
+            caption += f" On {len(suite.scenarios)} scenarios."
+        paths += figure.draw(found, figure.title, caption, folder)
     return paths

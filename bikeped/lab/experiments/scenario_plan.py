@@ -1,4 +1,4 @@
-"""A plan of one scenario from above: who goes where and when, what the camera sees, alerts."""
+"""A plan of one scenario from above: paths over time, the camera's view, alerts."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from bikeped.lab.plotting import (
     FigureSheet,
     escape_dollars,
     file_stem,
+    label,
 )
 from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.lab.simulation.suite import Suite
@@ -34,7 +35,7 @@ RINGS_M = (5, 10, 15, 20, 25)
 #: The crosswalk of the drawn scenes in the world frame, m: from west to east, from south to north.
 CROSSWALK_M = ((3.4, 6.6), (-6.0, 6.0))
 #: By kind of road user: colour, marker, dash.
-_LOOKS = {
+_STYLES = {
     "pedestrian": (GREEN, "o", "-"),
     "cyclist": (BLUE, "s", "-"),
     "motorcycle": (PURPLE, "D", "--"),
@@ -77,7 +78,7 @@ def draw_plan(suite: Suite, decision: DecisionConfig, index: int, folder: Path) 
 
 
 def _bounds(suite: Suite, scenario: Scenario) -> tuple[float, float, float, float]:
-    """The part of the world that is worth showing: paths near the camera, and the camera."""
+    """The part of the world that is drawn: paths near the camera, and the camera."""
     camera = np.array([suite.pose.x_m, suite.pose.y_m])
     points = np.concatenate([a.path[:, 1:] for a in scenario.agents])
     near = np.clip(points, camera - RANGE_M - 2, camera + RANGE_M + 2)
@@ -121,38 +122,22 @@ def _camera(axes: Axes, suite: Suite) -> None:
             low_x, high_x = axes.get_xlim()
             low_y, high_y = axes.get_ylim()
             if low_x + 1 < x < high_x - 1 and low_y + 0.5 < y < high_y - 0.5:
-                axes.annotate(
-                    f"{radius} m",
-                    (x, y),
-                    ha="center",
-                    va="center",
-                    fontsize=7,
-                    color="#4d6b7d",
-                    bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.4, "alpha": 0.8},
-                    zorder=1.5,
-                )
+                box = {"facecolor": "white", "edgecolor": "none", "pad": 0.4, "alpha": 0.8}
+                style: dict[str, Any] = {"fontsize": 7, "color": "#4d6b7d", "bbox": box}
+                label(axes, f"{radius} m", (x, y), ha="center", va="center", zorder=1.5, **style)
                 break
     axes.plot(*at, marker=(3, 0, facing - 90), color=BLACK, markersize=12, zorder=6)
 
 
 def _path(axes: Axes, agent: Agent, box: tuple[float, float, float, float], every: int) -> None:
     """A path with marks by the second, the time of every few of them, and the heading."""
-    colour, marker, dash = _LOOKS.get(agent.kind, _VEHICLE)
-    axes.plot(
-        agent.path[:, 1], agent.path[:, 2], color=colour, linestyle=dash, linewidth=1.4, zorder=2
-    )
+    colour, marker, dash = _STYLES.get(agent.kind, _VEHICLE)
+    _, x, y = agent.path.T
+    axes.plot(x, y, color=colour, linestyle=dash, linewidth=1.4, zorder=2)
     seconds = np.arange(math.ceil(agent.start_s - 1e-9), math.floor(agent.end_s + 1e-9) + 1)
     xy, heading, _ = agent.sample(seconds.astype(np.float64))
-    axes.plot(
-        xy[:, 0],
-        xy[:, 1],
-        marker,
-        color=colour,
-        markersize=4.5,
-        markerfacecolor="white",
-        zorder=3,
-        linestyle="",
-    )
+    marks: dict[str, Any] = {"markersize": 4.5, "markerfacecolor": "white", "zorder": 3}
+    axes.plot(xy[:, 0], xy[:, 1], marker, color=colour, linestyle="", **marks)
     last: FloatArray | None = None
     for t, point, angle in zip(seconds, xy, heading, strict=True):
         inside = box[0] < point[0] < box[1] and box[2] < point[1] < box[3]
@@ -161,17 +146,8 @@ def _path(axes: Axes, agent: Agent, box: tuple[float, float, float, float], ever
             continue
         last = point
         side = (-math.sin(angle), math.cos(angle))
-        axes.annotate(
-            f"{t:g}",
-            tuple(point),
-            (8 * side[0], 8 * side[1]),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=7,
-            color=colour,
-            zorder=4,
-        )
+        style = {"ha": "center", "va": "center", "fontsize": 7, "color": colour, "zorder": 4}
+        label(axes, f"{t:g}", (point[0], point[1]), (8 * side[0], 8 * side[1]), **style)
     _arrows(axes, agent, colour, box)
 
 
@@ -183,27 +159,16 @@ def _arrows(axes: Axes, agent: Agent, colour: str, box: tuple[float, float, floa
     index = np.nonzero(shown)[0]
     if not len(index) or np.hypot(*np.ptp(xy[index], axis=0)) < 0.5:
         return
+    arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 13}
     for share in (0.2, 0.55, 1.0):
         i = index[min(int(share * len(index)), len(index) - 1)]
         step = 0.45 * np.array([math.cos(heading[i]), math.sin(heading[i])])
-        axes.annotate(
-            "",
-            tuple(xy[i] + step),
-            tuple(xy[i] - step),
-            arrowprops={
-                "arrowstyle": "-|>",
-                "color": colour,
-                "linewidth": 0,
-                "mutation_scale": 13,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-            zorder=3.5,
-        )
+        ends = tuple(xy[i] + step), tuple(xy[i] - step)
+        axes.annotate("", *ends, arrowprops={**arrow, "shrinkA": 0, "shrinkB": 0}, zorder=3.5)
 
 
 def _alerts(axes: Axes, suite: Suite, decision: DecisionConfig, index: int) -> None:
-    """Where the frame's cyclist and pedestrian truly were when each alert began."""
+    """True positions of the frame's cyclist and pedestrian at each alert's onset."""
     scenario, truth = suite.scenarios[index], suite.truths[index]
     agents = {a.id: a for a in scenario.agents}
     state = suite.states(decision)[suite.rule_input.frame_slice(index)]
@@ -225,18 +190,9 @@ def _legend(kinds: list[str]) -> list[Any]:
 
     handles: list[Any] = []
     for kind in kinds:
-        colour, marker, dash = _LOOKS.get(kind, _VEHICLE)
-        handles.append(
-            Line2D(
-                [],
-                [],
-                color=colour,
-                marker=marker,
-                linestyle=dash,
-                markerfacecolor="white",
-                label=escape_dollars(kind),
-            )
-        )
+        colour, marker, dash = _STYLES.get(kind, _VEHICLE)
+        style: dict[str, Any] = {"marker": marker, "linestyle": dash, "markerfacecolor": "white"}
+        handles.append(Line2D([], [], color=colour, label=escape_dollars(kind), **style))
     alert = Line2D([], [], color=RED, marker="*", linestyle="", markersize=11, label="alert begins")
     camera = Line2D([], [], color=BLACK, marker="^", linestyle="", markersize=9, label="camera")
     return [*handles, alert, camera, Patch(facecolor=SKY, alpha=0.2, label="in view, 25 m")]

@@ -19,6 +19,8 @@ from bikeped.lab.plotting import (
     FigureSheet,
     escape_dollars,
     file_stem,
+    fill,
+    label,
 )
 from bikeped.lab.simulation.simulate import verdicts
 from bikeped.lab.simulation.suite import Suite
@@ -29,14 +31,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Colour, hatch and text colour of a state's band; the letters make it readable in grey.
-STATE_LOOKS = {
+_STATE_STYLES = {
     State.IDLE: (SKY, "", BLACK),
     State.SAFE: ("#7fcdbb", "", BLACK),
     State.WARNING: (ORANGE, "//", BLACK),
     State.ALERT: (RED, "", "white"),
 }
-#: Distances beyond this say nothing about an encounter, m.
+#: Longer distances do not matter to an encounter, m.
 _TOP_M = 30.0
+#: A label on a white ground, above all else.
+_BOXED: dict[str, Any] = {
+    "bbox": {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.6},
+    "zorder": 6,
+}
 
 
 def draw_strip(suite: Suite, decision: DecisionConfig, index: int, folder: Path) -> list[Path]:
@@ -50,17 +57,8 @@ def draw_strip(suite: Suite, decision: DecisionConfig, index: int, folder: Path)
         "camera alert. Shaded: danger in which a warning still helps, and hatched, danger that "
         "comes too soon. Arrow: what a distracted person needs to react."
     )
-    with FigureSheet(
-        title,
-        caption,
-        7.0,
-        3.5,
-        2,
-        1,
-        2,
-        sharex=True,
-        gridspec_kw={"height_ratios": [6, 1]},
-    ) as sheet:
+    ratios = {"height_ratios": [6, 1]}
+    with FigureSheet(title, caption, 7.0, 3.5, 2, 1, 2, sharex=True, gridspec_kw=ratios) as sheet:
         main, band = sheet.axes
         onset = onsets(state == State.ALERT)
         _shade(main, truth)
@@ -103,13 +101,8 @@ def _distances(axes: Axes, suite: Suite, decision: DecisionConfig, index: int) -
         top = float(np.nanmax(nearest))
     else:
         top = 10.0
-        axes.annotate(
-            "no cyclist and pedestrian at the same time",
-            (0.5, 0.5),
-            xycoords="axes fraction",
-            ha="center",
-            color=GREY,
-        )
+        place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "center", "fontsize": None}
+        label(axes, "no cyclist and pedestrian at the same time", (0.5, 0.5), color=GREY, **place)
     axes.set_ylim(0, min(max(top * 1.08, 6.0), _TOP_M))
     axes.set_ylabel("distance, m")
 
@@ -123,79 +116,39 @@ def _moments(axes: Axes, truth: GroundTruth, onset: BoolArray) -> None:
         axes.axvline(at, color=RED, linewidth=1.3, zorder=2)
         budget = float(truth.budget_s[frame])
         if number == 0:
-            axes.annotate(
-                "",
-                (at + PEDESTRIAN_PRT_S, top * 0.06),
-                (at, top * 0.06),
-                arrowprops={"arrowstyle": "->", "color": BLACK, "linewidth": 1.5, "shrinkA": 0},
-                zorder=6,
-            )
-            axes.annotate(
-                f"{PEDESTRIAN_PRT_S:g} s",
-                (at + PEDESTRIAN_PRT_S / 2, top * 0.06),
-                (0, 3),
-                textcoords="offset points",
-                ha="center",
-                fontsize=8,
-                bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.6},
-                zorder=6,
-            )
+            arrow = {"arrowstyle": "->", "color": BLACK, "linewidth": 1.5, "shrinkA": 0}
+            ends = (at + PEDESTRIAN_PRT_S, top * 0.06), (at, top * 0.06)
+            axes.annotate("", *ends, arrowprops=arrow, zorder=6)
+            middle = (at + PEDESTRIAN_PRT_S / 2, top * 0.06)
+            label(axes, f"{PEDESTRIAN_PRT_S:g} s", middle, (0, 3), ha="center", **_BOXED)
         if np.isfinite(budget) and at - last_label > 1.6:
             last_label = at
-            axes.annotate(
-                f"budget {budget:.2f} s",
-                (at, top * 0.985),
-                (3, 0),
-                textcoords="offset points",
-                va="top",
-                fontsize=8,
-                color="#8c2d04",
-                bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.6},
-                zorder=6,
-            )
+            text = f"budget {budget:.2f} s"
+            label(axes, text, (at, top * 0.985), (3, 0), va="top", color="#8c2d04", **_BOXED)
     if np.isfinite(truth.nearest_m).any():
         closest = int(np.argmin(truth.nearest_m))
         at, distance = float(truth.time_s[closest]), float(truth.nearest_m[closest])
         axes.plot(at, distance, "v", color=BLACK, markersize=8, zorder=5, clip_on=False)
-        axes.annotate(
-            f"{distance:.1f} m",
-            (at, distance),
-            (6, 7),
-            textcoords="offset points",
-            fontsize=8,
-            bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.6},
-            zorder=6,
-        )
+        label(axes, f"{distance:.1f} m", (at, distance), (6, 7), **_BOXED)
 
 
 def _band(axes: Axes, time_s: FloatArray, state: np.ndarray[Any, np.dtype[np.int8]]) -> None:
     """The state over time as a band with its names."""
     for code in State:
-        colour, hatch, ink = STATE_LOOKS[code]
+        colour, hatch, ink = _STATE_STYLES[code]
         for begin, end in spans(np.asarray(state == int(code)), time_s):
-            axes.barh(
-                0,
-                end - begin,
-                1.0,
-                left=begin,
-                color=colour,
-                hatch=hatch,
-                edgecolor="white",
-                linewidth=0,
-            )
-            # Some 0.11 in a letter; shorter spans are told by their colour.
+            axes.barh(0, end - begin, 1.0, left=begin, **fill(colour, hatch))
+            # About 0.11 in a letter; shorter spans have their colour only.
             if (end - begin) / time_s[-1] * 6.2 > 0.11 * len(code.name):
-                axes.text(
-                    (begin + end) / 2,
-                    0,
-                    code.name,
-                    ha="center",
-                    va="center",
-                    fontsize=7.5,
-                    fontweight="bold",
-                    color=ink,
-                    bbox={"facecolor": colour, "edgecolor": "none", "pad": 1.0},
-                )
+                box = {"facecolor": colour, "edgecolor": "none", "pad": 1.0}
+                centred: dict[str, Any] = {
+                    "ha": "center",
+                    "va": "center",
+                    "fontweight": "bold",
+                    "bbox": box,
+                }
+                middle = ((begin + end) / 2, 0)
+                axes.text(*middle, code.name, fontsize=7.5, color=ink, **centred)
     axes.set_yticks([])
     axes.set_ylim(-0.5, 0.5)
     axes.set_ylabel("state", rotation=0, ha="right", va="center")

@@ -83,7 +83,7 @@ DATA = {
         ]
     },
     "latency": {"delay_ms": [0, 100, 200], "none": SERIES, "first": SERIES, "second": SERIES},
-    "loss_latency": {"delay_ms": [0, 100, 200], "predictors": {"none": LOSS}},
+    "latency_loss": {"delay_ms": [0, 100, 200], "predictors": {"none": LOSS}},
     "budgets": {
         "rows": [
             {"scenario": "A $", "mean": 3.0, "min": 2.0, "onsets": [2.0, 4.0], "class": "below"},
@@ -143,7 +143,7 @@ def test_the_same_data_give_the_same_bytes_and_no_dates(suite, drawn, tmp_path):
 def test_absent_and_empty_experiments_are_skipped(suite, tmp_path):
     assert draw_all({}, suite, tmp_path) == []
     assert draw_all({"latency": {}, "errors": {"map": {}}}, suite, tmp_path) == []
-    one = draw_all({"latency_loss": DATA["loss_latency"]}, suite, tmp_path)
+    one = draw_all({"latency_loss": DATA["latency_loss"]}, suite, tmp_path)
     assert {p.stem for p in one} == {"loss_latency"}
 
 
