@@ -62,8 +62,8 @@ def open_light(config: FeedbackConfig) -> Light:
 def light_driver(config: FeedbackConfig) -> LightDriver:
     """The driver of the configured light, not yet started.
 
-    Raises FeedbackError when the wiring is wrong, which no retry mends. A device that is missing or
-    fails is no reason to stop: the driver retries for ever and reports it in `fault`.
+    Raises FeedbackError when the wiring is wrong. A device that is missing or fails is retried for
+    ever and reported in `LightDriver.fault`.
     """
     check_light(config)
     return LightDriver(partial(open_light, config), fault_blink_hz=config.fault_blink_hz)

@@ -1,11 +1,10 @@
 """The light: what a device must do, which lamp shows which colour, and the thread that drives it.
 
-`LightDriver` runs one thread of its own. It blinks without anybody's help, it is the only place
-that calls the device (a device that hangs blocks this thread and nothing else), and it is the
-deadman: when nobody has called `show` for `deadman_s`, the light turns to FAULT by itself. That has
-to be a thread and not an asyncio task, because a stuck event loop is the very case it is there
-for. What it cannot cover is a process that has died or whose interpreter is stuck: systemd's
-watchdog ends that process, and `python -m bikeped.feedback` (ExecStopPost) then darkens the light.
+`LightDriver` runs one thread. The thread blinks the light, it alone calls the device (a device that
+hangs blocks nothing else), and it is a watchdog: without a call of `show` for `watchdog_s` it shows
+FAULT. A thread and not an asyncio task, because it must work when the event loop is stuck. It does
+not cover a process that died or whose interpreter is stuck: systemd's watchdog ends that process,
+and `python -m bikeped.feedback` (ExecStopPost) then darkens the light.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _T = TypeVar("_T")
 #: A GPIO line by name or offset, or a relay by number; None is not wired.
 Lamp = str | int | None
 
-#: The fault of a light that the service has not set for `deadman_s`.
+#: The fault of a light that the service has not set for `watchdog_s`.
 NOT_REFRESHED = Fault("light", "light.not_refreshed", "not refreshed by the service")
 
 LAMP_COLOURS = (Colour.RED, Colour.ORANGE, Colour.GREEN, Colour.BLUE)
@@ -42,10 +41,10 @@ class Light(Protocol):
     """
 
     def set(self, colour: Colour) -> None:
-        """Shows `colour` and nothing else; `Colour.OFF` is dark. May take as long as it likes."""
+        """Shows `colour` and nothing else; `Colour.OFF` is dark. May block."""
 
     def close(self) -> None:
-        """Switches off and lets the device go."""
+        """Switches off and releases the device."""
 
 
 class SimulatedLight:
@@ -56,7 +55,7 @@ class SimulatedLight:
         self._lit = Colour.OFF
 
     def set(self, colour: Colour) -> None:
-        # The dark half of blinking is no news: a FAULT that lasts a month is one line.
+        # The dark half of blinking is not logged: a FAULT that lasts a month is one line.
         if colour not in (Colour.OFF, self._lit):
             _log.info("simulated light: %s", colour.value)
             self._lit = colour
@@ -70,9 +69,9 @@ class SimulatedLight:
 def assign_lamps(wired: Mapping[Colour, Lamp], section: str) -> dict[Colour, Lamp]:
     """Which lamp shows which colour, given the lamps that are wired; None is dark.
 
-    Without an orange lamp its signals (WARNING, FAULT) go to red, which never reassures. Green and
-    blue fall back to dark. Raises FeedbackError when red is missing, since then nothing could show
-    an ALERT, and when two colours share a lamp. `section` is the configuration section to name.
+    Without an orange lamp its signals (WARNING, FAULT) go to red, which never reassures; green and
+    blue fall back to dark. Raises FeedbackError, naming the configuration `section`, when red is
+    missing (no ALERT could be shown) or two colours share a lamp.
     """
     lamps = {colour: wired.get(colour) for colour in LAMP_COLOURS}
     if lamps[Colour.RED] is None:
@@ -97,13 +96,11 @@ def assign_lamps(wired: Mapping[Colour, Lamp], section: str) -> dict[Colour, Lam
 class LightDriver:
     """Shows signals on a light, from its own thread, and reports when the light does not obey.
 
-    `open_light` makes the device; it is called in the thread, at the start and after every error,
-    with pauses that double from `retry_s[0]` to `retry_s[1]` seconds. `deadman_s`: without a `show`
-    for this long the light shows FAULT. `hang_s`: a device call that takes longer is a fault.
-    `assert_s`: an unchanged colour is sent again this often, so that a light that was unplugged
-    while steady is noticed, and one that came back shows the truth.
-
-    The queue to the thread is one signal long: the newest replaces one that was not yet shown.
+    `open_light` opens the device, in the thread, at the start and after every error, with pauses
+    that double from `retry_s[0]` to `retry_s[1]` seconds. Without a `show` for `watchdog_s` the
+    light shows FAULT. A device call longer than `hang_s` is a fault. An unchanged colour is sent
+    again every `assert_s`, so that an unplugged or replugged light is noticed. A newer signal
+    replaces one that was not shown yet.
     """
 
     def __init__(
@@ -111,15 +108,15 @@ class LightDriver:
         open_light: Callable[[], Light],
         *,
         fault_blink_hz: float = 0.5,
-        deadman_s: float = 1.0,
+        watchdog_s: float = 1.0,
         hang_s: float = 2.0,
         assert_s: float = 2.0,
         retry_s: tuple[float, float] = (0.5, 30.0),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._open_light = open_light
-        self._deadman_signal = fault_signal((NOT_REFRESHED,), fault_blink_hz)
-        self._deadman_s = deadman_s
+        self._watchdog_signal = fault_signal((NOT_REFRESHED,), fault_blink_hz)
+        self._watchdog_s = watchdog_s
         self._hang_s = hang_s
         self._assert_s = assert_s
         self._retry_s = retry_s
@@ -133,7 +130,6 @@ class LightDriver:
         self._busy_since: float | None = None
         self._error: Fault | None = None
         self._errors = 0
-        self._deadman_trips = 0
 
         # The thread's own.
         self._light: Light | None = None
@@ -143,7 +139,7 @@ class LightDriver:
         self._pattern_s = 0.0
         self._retry_at_s: float | None = None
         self._pause_s = retry_s[0]
-        self._deadman = False
+        self._tripped = False
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -155,13 +151,13 @@ class LightDriver:
         self._thread.start()
 
     def show(self, signal: Signal) -> None:
-        """Shows `signal` from now on and holds the deadman off. Returns at once, always."""
+        """Shows `signal` from now on and restarts its watchdog. Returns at once, always."""
         with self._changed:
             old = self._signal
             self._signal = signal
             self._shown_s = self._clock()
             # At 30 calls a second the thread is only woken when there is something to do.
-            if self._deadman or old is None or _pattern_of(old) != _pattern_of(signal):
+            if self._tripped or old is None or _pattern_of(old) != _pattern_of(signal):
                 self._changed.notify()
 
     @property
@@ -181,16 +177,6 @@ class LightDriver:
         """Device calls that failed, since the start."""
         return self._errors
 
-    @property
-    def deadman_trips(self) -> int:
-        """How often the light turned to FAULT because nobody called `show`."""
-        return self._deadman_trips
-
-    @property
-    def colour(self) -> Colour | None:
-        """The colour that the device confirmed last; None when unknown."""
-        return self._applied
-
     def close(self, timeout_s: float = 2.0) -> bool:
         """Switches the light off and ends the thread; False when the device hangs.
 
@@ -204,37 +190,35 @@ class LightDriver:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def step(self, now_s: float) -> float:
-        """What the thread does at `now_s`: brings the light up to date.
+    def update(self, now_s: float) -> float:
+        """Brings the light up to date at `now_s`; returns when to call again.
 
-        Returns the time at which it wants to be called again. Only the thread calls this, and
-        tests that bring their own clock instead of a thread.
+        Only the thread calls this, and tests with their own clock instead of a thread.
         """
-        signal, deadman_at_s = self._effective(now_s)
+        signal, trips_at_s = self._effective(now_s)
         if _pattern_of(signal) != self._pattern:
             self._pattern = _pattern_of(signal)
             self._pattern_s = now_s
         colour, edge_s = _phase(self._pattern, self._pattern_s, now_s)
-        wake_s = [edge_s, deadman_at_s, self._bring(colour, now_s)]
+        wake_s = [edge_s, trips_at_s, self._apply(colour, now_s)]
         return min(wake_s)
 
     def _effective(self, now_s: float) -> tuple[Signal, float]:
-        """The signal that counts at `now_s`, and when the deadman would trip."""
+        """The signal that counts at `now_s`, and when the watchdog would trip."""
         with self._changed:
             signal, shown_s = self._signal, self._shown_s
-            stale = now_s - shown_s >= self._deadman_s
-            was, self._deadman = self._deadman, stale and signal is not None
+            stale = now_s - shown_s >= self._watchdog_s
+            was, self._tripped = self._tripped, stale and signal is not None
         # Logged outside the lock: a log that blocks must not block `show`.
-        if self._deadman and not was:
-            self._deadman_trips += 1
-            _log.error("%s for %g s; the light shows FAULT", NOT_REFRESHED, self._deadman_s)
-        elif was and not self._deadman:
-            _log.warning("light: refreshed again after the deadman had tripped")
+        if self._tripped and not was:
+            _log.error("%s for %g s; the light shows FAULT", NOT_REFRESHED, self._watchdog_s)
+        elif was and not self._tripped:
+            _log.warning("light: refreshed again after its watchdog had tripped")
         if stale or signal is None:
-            return self._deadman_signal, float("inf")
-        return signal, shown_s + self._deadman_s
+            return self._watchdog_signal, float("inf")
+        return signal, shown_s + self._watchdog_s
 
-    def _bring(self, colour: Colour, now_s: float) -> float:
+    def _apply(self, colour: Colour, now_s: float) -> float:
         """Makes the device show `colour`, if it does not already; returns when to look again."""
         if self._retry_at_s is not None and now_s < self._retry_at_s:
             return self._retry_at_s
@@ -247,7 +231,7 @@ class LightDriver:
             self._call(lambda: light.set(colour))
         except FeedbackError as error:
             return self._failed(str(error), now_s)
-        except Exception as error:  # noqa: BLE001 - a bug must not end the deadman's thread
+        except Exception as error:  # noqa: BLE001 - a bug must not end the watchdog's thread
             _log.debug("light: unexpected error", exc_info=True)
             return self._failed(f"{type(error).__name__}: {error}", now_s)
         self._succeeded()
@@ -292,7 +276,7 @@ class LightDriver:
             self._call(light.close)
         except FeedbackError as error:
             _log.debug("light: closing failed: %s", error)
-        except Exception as error:  # noqa: BLE001 - as in _bring
+        except Exception as error:  # noqa: BLE001 - as in _apply
             _log.warning("light: closing failed: %s: %s", type(error).__name__, error)
 
     def _run(self) -> None:
@@ -300,24 +284,24 @@ class LightDriver:
             with self._changed:
                 if self._closing:
                     break
-            wake_s = self.step(self._clock())
+            wake_s = self.update(self._clock())
             with self._changed:
                 wait_s = wake_s - self._clock()
-                if not self._closing and wait_s > 0 and not self._has_news():
-                    # Bounded, so that a clock that misbehaves cannot silence the deadman.
-                    self._changed.wait(min(wait_s, self._deadman_s))
+                if not self._closing and wait_s > 0 and not self._pattern_changed():
+                    # Bounded, so that a clock that misbehaves cannot stop the watchdog.
+                    self._changed.wait(min(wait_s, self._watchdog_s))
         if self._light is None and self._error is not None:
             # A relay keeps its last colour while it cannot be reached: one more try to darken it.
             self._retry_at_s = None
-            self._bring(Colour.OFF, self._clock())
+            self._apply(Colour.OFF, self._clock())
         self._release()
         self._applied = None
 
-    def _has_news(self) -> bool:
+    def _pattern_changed(self) -> bool:
         """Whether another pattern is due than the one that the last step began with."""
         signal = self._signal
-        if signal is None or self._clock() - self._shown_s >= self._deadman_s:
-            signal = self._deadman_signal
+        if signal is None or self._clock() - self._shown_s >= self._watchdog_s:
+            signal = self._watchdog_signal
         return _pattern_of(signal) != self._pattern
 
 

@@ -1,4 +1,4 @@
-"""The speaker: plays chime and bell by `aplay` (package alsa-utils), without ever waiting for it.
+"""The speaker: plays chime and bell by `aplay` (package alsa-utils), never blocking.
 
 `aplay -q -D <device>` without a file name reads a WAV file from its standard input (aplay(1)). It
 runs as a child process, so a sound card that hangs hangs the child, which is then killed; nothing
@@ -29,10 +29,10 @@ _log = logging.getLogger(__name__)
 class Speaker:
     """Plays one sound at a time; all methods belong to the event loop's thread.
 
-    The bell interrupts a chime; nothing interrupts a bell. A sound that comes within its cool-down
-    (counted from start to start), or while a sound of at least its rank plays, is dropped, not
-    queued: a late bell would warn of what is over. While ALERT lasts the service asks for the bell
-    with every frame, so the bell repeats at its cool-down.
+    The bell interrupts a chime; nothing interrupts a bell. A sound within its cool-down (counted
+    from start to start), or while a sound of at least its rank plays, is dropped, not queued: a
+    late bell would warn of what is over. ALERT asks for the bell with every frame, so it repeats at
+    its cool-down.
 
     `base` is the folder that relative WAV paths of the configuration start from. `grace_s`: how
     much longer than the sound a child may live. `retry_s`: the shortest pause after a failure.
@@ -68,23 +68,11 @@ class Speaker:
         self._tasks: set[asyncio.Task[None]] = set()
         self._playing = Sound.NONE
         self._fault: Fault | None = None
-        self._failures = 0
-        self._played = 0
 
     @property
     def fault(self) -> Fault | None:
         """Why the last sound was not heard; None when it was, or none was asked for."""
         return self._fault
-
-    @property
-    def failures(self) -> int:
-        """Sounds that could not be played, since the start."""
-        return self._failures
-
-    @property
-    def played(self) -> int:
-        """Sounds played to their end, since the start."""
-        return self._played
 
     @property
     def playing(self) -> Sound:
@@ -132,7 +120,6 @@ class Speaker:
             await asyncio.wait({before})
         error = await self._play(self._wavs[sound])
         if error is None:
-            self._played += 1
             if self._fault is not None:
                 _log.warning("speaker: works again")
             self._fault = None
@@ -141,7 +128,6 @@ class Speaker:
         if fault != self._fault:
             _log.log(fault.kind.severity, "%s", fault)
         self._fault = fault
-        self._failures += 1
         # A broken card must not cost a process thirty times a second, whatever the cool-down.
         self._ready_s[sound] = max(self._ready_s[sound], self._clock() + self._retry_s)
 

@@ -19,8 +19,10 @@ Feature reports travel as HID class requests SET_REPORT and GET_REPORT to the in
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
 from bikeped.errors import FeedbackError
 from bikeped.feedback.light import Lamp, assign_lamps
@@ -65,12 +67,6 @@ def relay_lamps(config: UsbConfig) -> dict[Colour, Lamp]:
     return assign_lamps(wired, SECTION)
 
 
-class _Protocol(Protocol):
-    """How one kind of device is told a colour."""
-
-    def show(self, colour: Colour) -> None: ...
-
-
 class UsbLight:
     """A USB light or relay board, opened and claimed; raises FeedbackError when it is not there.
 
@@ -85,7 +81,7 @@ class UsbLight:
             self._device = self._find(config, backend)
             try:
                 self._claim()
-                self._protocol: _Protocol = self._speak(config, lamps)
+                self._show = self._protocol(config, lamps)
             except BaseException:
                 self._util.dispose_resources(self._device)
                 raise
@@ -93,10 +89,10 @@ class UsbLight:
     def set(self, colour: Colour) -> None:
         """Shows `colour`; at most a few transfers of 0.3 s each."""
         with self._errors(f"{colour.value} cannot be set"):
-            self._protocol.show(colour)
+            self._show(colour)
 
     def close(self) -> None:
-        """Switches off and lets the device go."""
+        """Switches off and releases the device."""
         try:
             self.set(Colour.OFF)
         finally:
@@ -105,7 +101,7 @@ class UsbLight:
     def _find(self, config: UsbConfig, backend: Any) -> Any:
         """The one device that fits kind and serial number."""
         vendor, product = _IDS[config.device]
-        strangers: list[str] = []
+        other_devices: list[str] = []
         devices = self._core.find(
             find_all=True, idVendor=vendor, idProduct=product, backend=backend
         )
@@ -113,17 +109,17 @@ class UsbLight:
             # pyusb's default of 1 s also covers the string descriptors read here.
             device.default_timeout = TIMEOUT_MS
             if config.device == "relay" and not str(device.product or "").startswith("USBRelay"):
-                strangers.append(f"a {device.product}")
+                other_devices.append(f"a {device.product}")
             elif config.serial is None:
                 return device
             else:
                 serial = self._serial(config, device)
                 if serial == config.serial:
                     return device
-                strangers.append(f"serial {serial}")
+                other_devices.append(f"serial {serial}")
             self._util.dispose_resources(device)
         wanted = self._name if config.serial is None else f"{self._name}, serial {config.serial},"
-        others = f" (found {', '.join(strangers)})" if strangers else ""
+        others = f" (found {', '.join(other_devices)})" if other_devices else ""
         raise FeedbackError(f"{SECTION}.device: no {wanted} is plugged in{others}")
 
     def _serial(self, config: UsbConfig, device: Any) -> str:
@@ -138,13 +134,20 @@ class UsbLight:
         _detach(self._device)
         self._util.claim_interface(self._device, _INTERFACE)
 
-    def _speak(self, config: UsbConfig, lamps: dict[Colour, Lamp]) -> _Protocol:
+    def _protocol(self, config: UsbConfig, lamps: dict[Colour, Lamp]) -> Callable[[Colour], object]:
+        """What shows a colour on this kind of device."""
+        device = self._device
         if config.device == "blink1":
-            return _Blink1(self._device)
+            return lambda colour: _set_feature(
+                device, 1, bytes([1, ord("n"), *_RGB[colour], 0, 0, 0])
+            )
         if config.device == "luxafor":
-            return _Luxafor(self._device, self._out_endpoint())
+            endpoint = self._out_endpoint()
+            return lambda colour: device.write(
+                endpoint, bytes([0x01, 0xFF, *_RGB[colour], 0, 0, 0]), TIMEOUT_MS
+            )
         relays = {colour: lamp for colour, lamp in lamps.items() if isinstance(lamp, int)}
-        return _Relays(self._device, relays)
+        return _Relays(device, relays).show
 
     def _out_endpoint(self) -> int:
         interface = self._device.get_active_configuration()[(_INTERFACE, 0)]
@@ -154,39 +157,31 @@ class UsbLight:
                 return address
         raise FeedbackError(f"{SECTION}.device: this {self._name} has no output endpoint")
 
-    def _errors(self, what: str) -> contextlib.AbstractContextManager[None]:
-        return _as_feedback_error(f"{SECTION}: {self._name} {what}", self._core)
-
-
-class _Blink1:
-    """ThingM blink(1): one feature report a colour."""
-
-    def __init__(self, device: Any) -> None:
-        self._device = device
-
-    def show(self, colour: Colour) -> None:
-        _set_feature(self._device, 1, bytes([1, ord("n"), *_RGB[colour], 0, 0, 0]))
-
-
-class _Luxafor:
-    """Luxafor Flag: one interrupt transfer a colour."""
-
-    _STATIC, _ALL_LEDS = 0x01, 0xFF
-
-    def __init__(self, device: Any, endpoint: int) -> None:
-        self._device = device
-        self._endpoint = endpoint
-
-    def show(self, colour: Colour) -> None:
-        packet = bytes([self._STATIC, self._ALL_LEDS, *_RGB[colour], 0, 0, 0])
-        self._device.write(self._endpoint, packet, TIMEOUT_MS)
+    @contextlib.contextmanager
+    def _errors(self, what: str) -> Iterator[None]:
+        """Turns pyusb's errors into FeedbackError with the remedy."""
+        what = f"{SECTION}: {self._name} {what}"
+        try:
+            yield
+        except self._core.NoBackendError as error:
+            raise FeedbackError(
+                f"{what}: libusb is missing; install the system package libusb-1.0-0"
+            ) from error
+        except OSError as error:
+            remedy = ""
+            if error.errno == errno.EACCES:
+                remedy = "; install deploy/99-bikeped.rules, and is this user in group plugdev?"
+            raise FeedbackError(f"{what}: {error}{remedy}") from error
+        except ValueError as error:
+            # pyusb's answer to descriptors that it cannot read.
+            raise FeedbackError(f"{what}: {error}") from error
 
 
 class _Relays:
     """HID relay board: one relay a colour, read back after every change.
 
     Only relays that must change are switched, for mechanical ones wear, and only those that are
-    wired to a colour: what else hangs on the board is none of our business.
+    wired to a colour.
     """
 
     _ON, _OFF = 0xFF, 0xFD
@@ -257,21 +252,3 @@ def _load_pyusb() -> tuple[Any, Any]:
         raise FeedbackError(
             "feedback.light: usb needs the Python package pyusb; install bikeped[usb]"
         ) from error
-
-
-@contextlib.contextmanager
-def _as_feedback_error(what: str, core: Any) -> Any:
-    try:
-        yield
-    except core.NoBackendError as error:
-        raise FeedbackError(
-            f"{what}: libusb is missing; install the system package libusb-1.0-0"
-        ) from error
-    except OSError as error:
-        mend = ""
-        if error.errno == 13:
-            mend = "; install deploy/99-bikeped.rules, and is this user in group plugdev?"
-        raise FeedbackError(f"{what}: {error}{mend}") from error
-    except ValueError as error:
-        # pyusb's answer to descriptors that it cannot read.
-        raise FeedbackError(f"{what}: {error}") from error

@@ -172,7 +172,7 @@ async def _replay(
         # A replay must not switch the lamps of a crossing. It may run slower than real time, so its
         # light has a watchdog of an hour.
         blink_hz = loaded.config.feedback.fault_blink_hz
-        light = LightDriver(SimulatedLight, fault_blink_hz=blink_hz, deadman_s=3600.0)
+        light = LightDriver(SimulatedLight, fault_blink_hz=blink_hz, watchdog_s=3600.0)
         light.start()
         stack.push_async_callback(asyncio.to_thread, light.close)
         application = Application(
