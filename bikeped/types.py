@@ -177,6 +177,18 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.id)
 
+    def take(self, index: npt.NDArray[Any]) -> Tracks:
+        """The tracks at `index` (integers or a mask), in that order."""
+        return Tracks(
+            self.time_s,
+            self.id[index],
+            self.kind[index],
+            self.xy_m[index],
+            self.velocity_mps[index],
+            self.unseen_s[index],
+            self.detection[index],
+        )
+
     @staticmethod
     def empty(time_s: float) -> Tracks:
         none = np.zeros(0, np.int64)

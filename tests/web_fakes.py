@@ -15,8 +15,9 @@ from bikeped.pipeline.detection_stage import DecodedFrame
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.pipeline.web_context import WebContext
-from bikeped.telemetry.builders import ComponentStatus, Counters, HealthMessage, health_message
+from bikeped.telemetry.builders import health_message
 from bikeped.telemetry.mqtt import MqttStatus
+from bikeped.telemetry.schema import ComponentStatus, Counters, HealthMessage
 from bikeped.types import Colour, Detections, Frame, Kind, Signal
 from bikeped.web.security import AccessPolicy
 

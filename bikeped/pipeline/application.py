@@ -32,10 +32,11 @@ from bikeped.pipeline.telemetry import Telemetry
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.pipeline.web_context import Pages, WebContext
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.builders import EventHeader, HealthMessage, event_header
+from bikeped.telemetry.builders import rfc3339
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.mqtt import MqttPublisher
+from bikeped.telemetry.schema import EventHeader, HealthMessage
 
 
 def load_detector_pool(loaded: LoadedConfig, *, recorded: bool = False) -> DetectorPool:
@@ -65,12 +66,13 @@ def load_detector_pool(loaded: LoadedConfig, *, recorded: bool = False) -> Detec
 
 def new_event_header(loaded: LoadedConfig, detector: FrameDetector) -> EventHeader:
     """The header of an event file or audit log that starts now."""
-    return event_header(
+    return EventHeader(
+        format="bikeped-events/1",
         config_hash=loaded.hash,
         calibration_hash=loaded.calibration_hash,
         model_hash=detector.model_hash,
         version=__version__,
-        started_unix_s=time.time(),
+        started_at=rfc3339(time.time()),
     )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.rate_limited_log import RateLimitedLogger
 from bikeped.pipeline.telemetry import Telemetry
-from bikeped.telemetry.builders import HealthMessage
+from bikeped.telemetry.schema import HealthMessage
 
 log = logging.getLogger(__name__)
 

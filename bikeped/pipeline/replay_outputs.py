@@ -17,8 +17,8 @@ from bikeped.overlay import OverlayData, VideoWriter, compose, ground_projector
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.builders import EventHeader
 from bikeped.telemetry.events import EventWriter
+from bikeped.telemetry.schema import EventHeader
 from bikeped.types import Kind, State
 
 OVERLAY_SIZE = (1600, 720)

@@ -19,11 +19,6 @@ from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import (
-    ComponentStatus,
-    Counters,
-    EventLine,
-    HealthMessage,
-    ShownState,
     encode,
     event_line,
     health_message,
@@ -33,6 +28,7 @@ from bikeped.telemetry.builders import (
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.mqtt import MqttPublisher
+from bikeped.telemetry.schema import ComponentStatus, Counters, EventLine, HealthMessage, ShownState
 from bikeped.types import Decision, Signal, State
 
 

@@ -13,8 +13,8 @@ from bikeped.config import LoadedConfig
 from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.signal_dispatcher import SignalListener
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.builders import HealthMessage
 from bikeped.telemetry.mqtt import MqttStatus
+from bikeped.telemetry.schema import HealthMessage
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from bikeped.config import AuditConfig
-from bikeped.telemetry.builders import EventHeader, EventLine, encode_line
+from bikeped.telemetry.builders import encode_line
+from bikeped.telemetry.schema import EventHeader, EventLine
 
 log = logging.getLogger(__name__)
 

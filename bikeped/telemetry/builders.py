@@ -1,4 +1,4 @@
-"""Builds every MQTT payload and every event line (their shapes are in `shapes`). Pure.
+"""Builds every MQTT payload and every event line of the types in `schema`. Pure.
 
 Positions are rounded to a millimetre, so that files read well and two replays of one recording
 agree byte for byte. Only `latency_ms` and `started_at` differ between two runs; they come
@@ -11,7 +11,7 @@ import datetime as dt
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -20,7 +20,6 @@ import numpy.typing as npt
 from bikeped.errors import TelemetryError
 from bikeped.faults import Fault, fault_texts
 from bikeped.telemetry.schema import (
-    Availability,
     CameraHealth,
     ComponentStatus,
     Counters,
@@ -38,52 +37,9 @@ from bikeped.telemetry.schema import (
     TracksMessage,
     Velocity,
 )
-from bikeped.types import Decision, Detections, FloatArray, Kind, State, Tracks
-
-__all__ = [
-    "VOLATILE_KEYS",
-    "Availability",
-    "CameraHealth",
-    "ComponentStatus",
-    "Counters",
-    "EventDetection",
-    "EventHeader",
-    "EventLine",
-    "EventTrack",
-    "HealthMessage",
-    "Position",
-    "ShownState",
-    "StageLatency",
-    "StateMessage",
-    "TrackedObject",
-    "TracksMessage",
-    "Velocity",
-    "decision_digest",
-    "decision_view",
-    "encode",
-    "encode_line",
-    "event_header",
-    "event_line",
-    "health_message",
-    "parse_event",
-    "rfc3339",
-    "state_message",
-    "tracks_message",
-]
+from bikeped.types import Decision, Detections, FloatArray, Kind, KindArray, Tracks
 
 VOLATILE_KEYS = ("latency_ms", "started_at")  #: the only keys that differ between two replays
-
-_LABELS: dict[int, KindLabel] = {
-    Kind.PEDESTRIAN: "pedestrian",
-    Kind.CYCLIST: "cyclist",
-    Kind.VEHICLE: "vehicle",
-}
-_STATES: dict[State, ShownState] = {
-    State.IDLE: "IDLE",
-    State.SAFE: "SAFE",
-    State.WARNING: "WARNING",
-    State.ALERT: "ALERT",
-}
 
 _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder()
@@ -117,32 +73,46 @@ def tracks_message(
     """The tracks message of one frame captured at `unix_s` (seconds since 1970).
 
     `history` maps a track id to its recent [x, y] in metres, oldest first; a track that it does not
-    name gets none. A track without finite numbers is left out: it has no place on a map, and JSON
-    has no word for it.
+    name gets none. Tracks without finite numbers are left out.
     """
-    keep = _finite(tracks)
-    xy, velocity = tracks.xy_m[keep], tracks.velocity_mps[keep]
+    tracks = finite_tracks(tracks)
+    distance_m = _rounded(np.hypot(tracks.xy_m[:, 0], tracks.xy_m[:, 1]), 3)
+    speed_mps = _rounded(np.hypot(tracks.velocity_mps[:, 0], tracks.velocity_mps[:, 1]), 3)
     objects = [
         TrackedObject(
-            track_id=track_id,
-            class_=_LABELS[kind],
-            position=Position(x=x, y=y, distance=distance),
-            velocity=Velocity(x=vx, y=vy, speed=speed),
-            history=_points(history.get(track_id, ())),
+            track_id=track.id,
+            class_=track.kind,
+            position=Position(x=track.x, y=track.y, distance=distance),
+            velocity=Velocity(x=track.vx, y=track.vy, speed=speed),
+            history=_points(history.get(track.id, ())),
         )
-        for track_id, kind, (x, y), distance, (vx, vy), speed in zip(
-            tracks.id[keep].tolist(),
-            tracks.kind[keep].tolist(),
-            _rounded(xy, 3),
-            _rounded(np.hypot(xy[:, 0], xy[:, 1]), 3),
-            _rounded(velocity, 3),
-            _rounded(np.hypot(velocity[:, 0], velocity[:, 1]), 3),
-            strict=True,
-        )
+        for track, distance, speed in zip(track_records(tracks), distance_m, speed_mps, strict=True)
     ]
     return TracksMessage(
         timestamp=rfc3339(unix_s), frame_number=frame_number, state=state, objects=objects
     )
+
+
+def finite_tracks(tracks: Tracks) -> Tracks:
+    """The tracks with finite numbers: others have no place on a map, and JSON has no NaN."""
+    numbers = np.concatenate([tracks.xy_m, tracks.velocity_mps], axis=1)
+    return tracks.take(np.isfinite(numbers).all(axis=1))
+
+
+def track_records(tracks: Tracks) -> list[EventTrack]:
+    """Finite tracks as they stand in event lines, rounded to a millimetre."""
+    rows = zip(
+        tracks.id.tolist(),
+        _labels(tracks.kind),
+        _rounded(tracks.xy_m, 3),
+        _rounded(tracks.velocity_mps, 3),
+        (tracks.unseen_s > 0).tolist(),
+        strict=True,
+    )
+    return [
+        EventTrack(id=track_id, kind=kind, x=x, y=y, vx=vx, vy=vy, lost=lost)
+        for track_id, kind, (x, y), (vx, vy), lost in rows
+    ]
 
 
 def state_message(
@@ -158,7 +128,7 @@ def state_message(
     `shown` and `sentence` replace the decision's own where the light says something else: FAULT
     with its cause, or OFF. A pair belongs to a decision, so FAULT and OFF carry none.
     """
-    state = shown or _STATES[decision.state]
+    state = shown or _state(decision)
     pair = None if state in ("FAULT", "OFF") else decision.pair
     return StateMessage(
         state=state,
@@ -213,25 +183,6 @@ def health_message(
     )
 
 
-def event_header(
-    *,
-    config_hash: str,
-    calibration_hash: str | None,
-    model_hash: str | None,
-    version: str,
-    started_unix_s: float,
-) -> EventHeader:
-    """The header of a run that started at `started_unix_s` (seconds since 1970)."""
-    return EventHeader(
-        format="bikeped-events/1",
-        config_hash=config_hash,
-        calibration_hash=calibration_hash,
-        model_hash=model_hash,
-        version=version,
-        started_at=rfc3339(started_unix_s),
-    )
-
-
 def event_line(
     *,
     t_s: float,
@@ -247,29 +198,18 @@ def event_line(
     `light` is what the light showed, None where that is what was decided. Tracks without finite
     numbers are left out, as in `tracks_message`.
     """
-    keep = _finite(tracks)
     pair = decision.pair
     return EventLine(
         t=_number(t_s, 4) or 0.0,
         frame=frame,
-        state=_STATES[decision.state],
-        light=light or _STATES[decision.state],
+        state=_state(decision),
+        light=light or _state(decision),
         pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
-        tracks=[
-            EventTrack(id=track_id, kind=_LABELS[kind], x=x, y=y, vx=vx, vy=vy, lost=lost)
-            for track_id, kind, (x, y), (vx, vy), lost in zip(
-                tracks.id[keep].tolist(),
-                tracks.kind[keep].tolist(),
-                _rounded(tracks.xy_m[keep], 3),
-                _rounded(tracks.velocity_mps[keep], 3),
-                (tracks.unseen_s[keep] > 0).tolist(),
-                strict=True,
-            )
-        ],
+        tracks=track_records(finite_tracks(tracks)),
         detections=[
-            EventDetection(kind=_LABELS[kind], confidence=confidence, box=tuple(box))
+            EventDetection(kind=kind, confidence=confidence, box=tuple(box))
             for kind, confidence, box in zip(
-                detections.kind.tolist(),
+                _labels(detections.kind),
                 _rounded(detections.confidence, 4),
                 _rounded(detections.box_px, 1),
                 strict=True,
@@ -323,9 +263,12 @@ def decision_digest(lines: Iterable[bytes | str]) -> str:
     return digest.hexdigest()
 
 
-def _finite(tracks: Tracks) -> npt.NDArray[np.bool_]:
-    numbers = np.concatenate([tracks.xy_m, tracks.velocity_mps], axis=1)
-    return np.asarray(np.isfinite(numbers).all(axis=1))
+def _state(decision: Decision) -> ShownState:
+    return cast(ShownState, decision.state.name)
+
+
+def _labels(kinds: KindArray) -> list[KindLabel]:
+    return [cast(KindLabel, Kind(kind).label) for kind in kinds.tolist()]
 
 
 def _rounded(values: npt.NDArray[Any] | Sequence[Any], decimals: int) -> list[Any]:

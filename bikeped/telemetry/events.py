@@ -7,7 +7,8 @@ from pathlib import Path
 from types import TracebackType
 
 from bikeped.errors import TelemetryError
-from bikeped.telemetry.builders import EventHeader, EventLine, encode_line
+from bikeped.telemetry.builders import encode_line
+from bikeped.telemetry.schema import EventHeader, EventLine
 
 
 class EventWriter:

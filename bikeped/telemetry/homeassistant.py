@@ -15,7 +15,7 @@ from typing import Any, get_args
 import msgspec
 
 from bikeped.config import MqttConfig
-from bikeped.telemetry.builders import ShownState
+from bikeped.telemetry.schema import ShownState
 
 
 def discovery_messages(config: MqttConfig, version: str) -> dict[str, bytes]:

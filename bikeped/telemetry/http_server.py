@@ -15,7 +15,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
 from bikeped.config import WebConfig
-from bikeped.telemetry.builders import ShownState
+from bikeped.telemetry.schema import ShownState
 
 log = logging.getLogger(__name__)
 _requests_log = log.getChild("requests")

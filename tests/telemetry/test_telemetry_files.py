@@ -16,13 +16,19 @@ import pytest
 from bikeped.config import AuditConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.audit import AuditLog
-from bikeped.telemetry.builders import EventHeader, EventLine, event_header, event_line
+from bikeped.telemetry.builders import event_line, rfc3339
 from bikeped.telemetry.events import EventWriter
+from bikeped.telemetry.schema import EventHeader, EventLine
 from bikeped.types import Decision, Detections, State, Tracks
 
 DEADLINE_S = 30.0
-HEADER = event_header(
-    config_hash="c", calibration_hash=None, model_hash=None, version="1", started_unix_s=0.0
+HEADER = EventHeader(
+    format="bikeped-events/1",
+    config_hash="c",
+    calibration_hash=None,
+    model_hash=None,
+    version="1",
+    started_at=rfc3339(0.0),
 )
 
 

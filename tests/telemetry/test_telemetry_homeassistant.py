@@ -10,8 +10,8 @@ import msgspec
 import pytest
 
 from bikeped.config import MqttConfig
-from bikeped.telemetry.builders import HealthMessage, ShownState, StageLatency, StateMessage
 from bikeped.telemetry.homeassistant import discovery_messages, object_id
+from bikeped.telemetry.schema import HealthMessage, ShownState, StageLatency, StateMessage
 
 TOPIC = re.compile(r"^homeassistant/(sensor|binary_sensor)/([a-zA-Z0-9_-]+)/config$")
 TYPES = {"state": StateMessage, "health": HealthMessage}

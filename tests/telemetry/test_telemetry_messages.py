@@ -22,6 +22,7 @@ from bikeped.errors import TelemetryError
 from bikeped.faults import Fault
 from bikeped.telemetry import builders as m
 from bikeped.telemetry import json_schema as schemas
+from bikeped.telemetry import schema as wire
 from bikeped.types import Decision, Detections, PairMetrics, State, Tracks
 
 DOCS = Path(__file__).parents[2] / "docs" / "messages"
@@ -54,7 +55,7 @@ DETECTIONS = Detections(
     np.array([0.1], np.float32),
     np.array([[1.04, 2.06, 3.0, 4.0]], np.float32),
 )
-COUNTERS = m.Counters(
+COUNTERS = wire.Counters(
     received=13,
     frames=9,
     dropped=1,
@@ -67,7 +68,7 @@ COUNTERS = m.Counters(
 )
 
 
-def tracks_message(**changes) -> m.TracksMessage:
+def tracks_message(**changes) -> wire.TracksMessage:
     values = {
         "unix_s": NOON,
         "frame_number": 42,
@@ -78,7 +79,7 @@ def tracks_message(**changes) -> m.TracksMessage:
     return m.tracks_message(**{**values, **changes})
 
 
-def health_message(**changes) -> m.HealthMessage:
+def health_message(**changes) -> wire.HealthMessage:
     values = {
         "unix_s": NOON,
         "state": "FAULT",
@@ -87,17 +88,17 @@ def health_message(**changes) -> m.HealthMessage:
         "uptime_s": 12.34,
         "fps": 29.987654,
         "latency_ms": {"total": {"p50": 1.234, "p95": 2.0, "p99": 3.0, "max": 4.0, "mean": 1.5}},
-        "camera": m.ComponentStatus(ok=False, detail="no frame for 2 s"),
+        "camera": wire.ComponentStatus(ok=False, detail="no frame for 2 s"),
         "capture_age_ms": None,
-        "detector": m.ComponentStatus(ok=True, detail="onnxruntime, CPU"),
-        "light": m.ComponentStatus(ok=True, detail="gpio"),
+        "detector": wire.ComponentStatus(ok=True, detail="onnxruntime, CPU"),
+        "light": wire.ComponentStatus(ok=True, detail="gpio"),
         "faults": [Fault("camera", "camera.no_frame", "no frame for 2 s")],
         "counters": COUNTERS,
     }
     return m.health_message(**{**values, **changes})
 
 
-def event_line(**changes) -> m.EventLine:
+def event_line(**changes) -> wire.EventLine:
     values = {
         "t_s": 1.23456,
         "frame": 42,
@@ -109,13 +110,14 @@ def event_line(**changes) -> m.EventLine:
     return m.event_line(**{**values, **changes})
 
 
-def event_header(started_unix_s: float = NOON) -> m.EventHeader:
-    return m.event_header(
+def event_header(started_unix_s: float = NOON) -> wire.EventHeader:
+    return wire.EventHeader(
+        format="bikeped-events/1",
         config_hash="c0ffee",
         calibration_hash=None,
         model_hash="abc",
         version="0.1.0",
-        started_unix_s=started_unix_s,
+        started_at=m.rfc3339(started_unix_s),
     )
 
 
@@ -300,7 +302,7 @@ def test_written_numbers_are_exact_to_half_a_millimetre_and_read_back_the_same(r
     )
     line = m.encode_line(event_line(tracks=tracks))
     parsed = m.parse_event(line)
-    assert isinstance(parsed, m.EventLine)
+    assert isinstance(parsed, wire.EventLine)
     for row, track in zip(rows, parsed.tracks, strict=True):
         for wanted, got in zip(row, (track.x, track.y, track.vx, track.vy), strict=True):
             assert abs(wanted - got) <= 0.0005 + 1e-9

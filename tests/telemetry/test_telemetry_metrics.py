@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from prometheus_client import REGISTRY
 
-from bikeped.telemetry.builders import Counters
 from bikeped.telemetry.metrics import Metrics
+from bikeped.telemetry.schema import Counters
 from bikeped.types import Detections, Tracks
 
 DETECTIONS = Detections(
