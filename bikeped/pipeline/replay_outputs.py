@@ -10,10 +10,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import numpy as np
-
 from bikeped.decision.episodes import EpisodeTracker
-from bikeped.overlay import OverlayData, VideoWriter, compose, ground_projector
+from bikeped.overlay import VideoWriter, compose
+from bikeped.pipeline.frame_overlay import frame_overlay
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import TrackAndDecide
@@ -85,36 +84,26 @@ class EventFile:
 class OverlayVideo:
     """The overlay video of a replay: drawn in a thread, while the next frame is looked at."""
 
-    def __init__(self, sink: VideoWriter, track_and_decide: TrackAndDecide) -> None:
-        self._sink, self._track_and_decide = sink, track_and_decide
+    def __init__(self, writer: VideoWriter, track_and_decide: TrackAndDecide) -> None:
+        self._writer, self._track_and_decide = writer, track_and_decide
         self._fov_deg = math.degrees(2 * track_and_decide.ground_mapper.camera.lens.max_theta_rad)
         self._drawing: asyncio.Task[None] | None = None
 
     async def on_frame_result(self, result: FrameResult) -> None:
         await self.wait()
-        frame, tracking = result.decoded.frame, result.tracking
-        overlay_data = OverlayData(
-            detections=result.detections,
-            tracks=tracking.tracks,
-            decision=tracking.decision,
-            frame_number=frame.number,
-            time_s=result.t_s,
-            latency_s=result.latency_ms["total"] / 1e3,
-            history={k: np.asarray(v) for k, v in self._track_and_decide.tracker.history().items()},
-        )
-        framing = self._track_and_decide.ground_mapper.framing_for(frame.width, frame.height)
-        projector = ground_projector(self._track_and_decide.ground_mapper.camera, framing)
+        data, to_frame = frame_overlay(result, self._track_and_decide)
+        camera = self._track_and_decide.ground_mapper.camera
 
         def draw() -> None:
-            self._sink.write(
+            self._writer.write(
                 compose(
                     result.decoded.rgb,
-                    overlay_data,
-                    self._sink.size,
-                    frame_width=frame.width,
-                    ground_to_frame=projector,
+                    data,
+                    self._writer.size,
+                    frame_width=result.decoded.frame.width,
+                    ground_to_frame=to_frame,
                     fov_deg=self._fov_deg,
-                    heading_deg=self._track_and_decide.ground_mapper.camera.heading_deg,
+                    heading_deg=camera.heading_deg,
                 )
             )
 

@@ -1,7 +1,7 @@
-"""The live page: what the box sees, what it decided and why, and how it is.
+"""The live page: picture, decision and its reason, health.
 
-`/live/events` sends what changes as server-sent events, `/live/stream` the picture as Motion JPEG.
-Each client has room for the newest only: who is slow sees less, and nobody waits for him.
+`/live/events` sends changes as server-sent events, `/live/stream` the picture as Motion JPEG. A
+slow client skips frames; the service never waits for one.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from bikeped.web.live_picture import PictureRenderer
 from bikeped.web.live_state import LiveState
 from bikeped.web.server import Page, add_page
 
-#: At most so many messages a second to one page.
+#: Limit of messages per second to one page.
 EVENTS_HZ = 10.0
 STATUS_S = 1.0
-#: A client that takes nothing for so long is let go.
+#: A client that accepts no data for this long is disconnected.
 WRITE_S = 10.0
-#: What may be on its way to a slow client: more would only be older when it arrives.
+#: Bytes in flight to a slow client: more would only be older on arrival.
 _SEND_BUFFER = 128 * 1024
 _BOUNDARY = "bikeped-picture-4c1d9f"
 #: Between two pictures; Chromium shows one when it has read the headers of the next.
@@ -37,7 +37,7 @@ _EDGE = f"\r\n--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n\r\n".encode()
 
 
 class LivePage:
-    """The live page of one running service or replay."""
+    """Handlers of the live page of one running service or replay."""
 
     def __init__(self, state: LiveState, web_context: WebContext) -> None:
         self._config: WebConfig = web_context.loaded.config.web
@@ -57,22 +57,22 @@ class LivePage:
     async def events(self, request: web.Request) -> web.StreamResponse:
         """Server-sent events: `hello` once, `now` up to ten a second, `status` every second,
         `alerts` when they change."""
-        with self._counted("_pages"), _until_left():
+        with self._counted("_pages"), _suppress_disconnect():
             response = web.StreamResponse(
                 headers={hdrs.CONTENT_TYPE: "text/event-stream", "X-Accel-Buffering": "no"}
             )
             await response.prepare(request)
-            _keep_little(request)
+            _limit_send_buffer(request)
             await _send(request, response, _event("hello", msgspec.json.encode(self._hello())))
             number, alerts, next_status_s, trend_s = -1, -1, 0.0, 0.0
             state = self._state
             while not state.closed:
-                await state.changed(number, STATUS_S)
+                await state.wait_changed(number, STATUS_S)
                 began_s = time.monotonic()
-                number = state.number
+                number = state.revision
                 parts = [_event("now", self._encode_now())]
-                if state.alerts_number != alerts:
-                    alerts = state.alerts_number
+                if state.alerts_revision != alerts:
+                    alerts = state.alerts_revision
                     parts.append(_event("alerts", msgspec.json.encode(list(state.alerts))))
                 if began_s >= next_status_s:
                     next_status_s = began_s + STATUS_S
@@ -85,19 +85,19 @@ class LivePage:
                 await asyncio.sleep(1.0 / EVENTS_HZ)
         return response
 
-    async def room(self, _request: web.Request) -> web.Response:
-        """204 when there is room for one more page: browsers do not tell why a stream failed."""
+    async def capacity(self, _request: web.Request) -> web.Response:
+        """204 when one more page may open, else 503: a failed stream gives a browser no reason."""
         with self._counted("_pages"):
             return web.Response(status=204)
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """The picture with boxes, tracks and the pair, as Motion JPEG."""
-        with self._counted("_streams"), self.renderer.looking(), _until_left():
+        with self._counted("_streams"), self.renderer.viewer(), _suppress_disconnect():
             response = web.StreamResponse(
                 headers={hdrs.CONTENT_TYPE: f"multipart/x-mixed-replace; boundary={_BOUNDARY}"}
             )
             await response.prepare(request)
-            _keep_little(request)
+            _limit_send_buffer(request)
             await _send(request, response, _EDGE)
             number = -1
             while (picture := await self.renderer.next(number)) is not None:
@@ -107,7 +107,7 @@ class LivePage:
 
     @contextlib.contextmanager
     def _counted(self, what: str) -> Iterator[None]:
-        """Room for one more of the page's streams; HTTPServiceUnavailable when there is none."""
+        """Counts one more stream of a kind; HTTPServiceUnavailable above `web.max_viewers`."""
         if getattr(self, what) >= self._config.max_viewers:
             raise web.HTTPServiceUnavailable(
                 text=f"{self._config.max_viewers} live pages are open already, and "
@@ -121,7 +121,7 @@ class LivePage:
             setattr(self, what, getattr(self, what) - 1)
 
     def _hello(self) -> dict[str, Any]:
-        """What does not change while the service runs."""
+        """Data that stay the same while the service runs."""
         loaded, lens = (
             self._web_context.loaded,
             self._web_context.track_and_decide.ground_mapper.camera.lens,
@@ -144,15 +144,15 @@ class LivePage:
         }
 
     def _encode_now(self) -> bytes:
-        """The moment as JSON, made once for all pages; without news anew all the same, for the
-        ages in it grow."""
-        key = (self._state.number, int(time.monotonic() * EVENTS_HZ))
+        """The snapshot as JSON, encoded once for all pages; again without a change too, as its ages
+        grow."""
+        key = (self._state.revision, int(time.monotonic() * EVENTS_HZ))
         if self._now[0] != key:
             self._now = (key, msgspec.json.encode(self._state.snapshot()))
         return self._now[1]
 
     def _encode_status(self, now_s: float) -> bytes:
-        """Health and broker as JSON, made once a second for all pages."""
+        """Health and broker as JSON, encoded once a second for all pages."""
         if now_s - self._status[0] >= 0.9 * STATUS_S:
             mqtt = None if self._web_context.mqtt is None else self._web_context.mqtt()
             status = {"health": self._web_context.health(), "mqtt": mqtt}
@@ -161,7 +161,7 @@ class LivePage:
 
 
 def display_source(source: str) -> str:
-    """A camera's name for people: without a password in an address, or the way to a file."""
+    """A camera's name without password or folder."""
     if "://" in source:
         scheme, _, rest = source.partition("://")
         return f"{scheme}://{rest.rpartition('@')[2]}"
@@ -174,7 +174,7 @@ def add_live(app: web.Application, live: LivePage) -> None:
     add_page(app, page)
     app.router.add_get("/live/events", live.events, allow_head=False)
     app.router.add_get("/live/stream", live.stream, allow_head=False)
-    app.router.add_get("/live/room", live.room)
+    app.router.add_get("/live/room", live.capacity)
 
     async def close(_app: web.Application) -> None:
         live.close()
@@ -183,8 +183,8 @@ def add_live(app: web.Application, live: LivePage) -> None:
 
 
 @contextlib.contextmanager
-def _until_left() -> Iterator[None]:
-    """A visitor who leaves is the usual end of a stream, and nothing to tell the log."""
+def _suppress_disconnect() -> Iterator[None]:
+    """Closing the page is the usual end of a stream; it is not logged."""
     with contextlib.suppress(ConnectionError):
         yield
 
@@ -193,8 +193,8 @@ def _event(name: str, data: bytes) -> bytes:
     return b"event: %s\ndata: %s\n\n" % (name.encode(), data)
 
 
-def _keep_little(request: web.Request) -> None:
-    """Keeps the system from holding seconds of old pictures for a slow client."""
+def _limit_send_buffer(request: web.Request) -> None:
+    """Keeps the system from buffering seconds of old pictures for a slow client."""
     transport = request.transport
     sock = None if transport is None else transport.get_extra_info("socket")
     if sock is not None:
@@ -203,10 +203,10 @@ def _keep_little(request: web.Request) -> None:
 
 
 async def _send(request: web.Request, response: web.StreamResponse, data: bytes) -> None:
-    """Sends, or lets a client go that takes nothing for WRITE_S."""
+    """Sends `data`; disconnects a client that accepts none for WRITE_S."""
     try:
         await asyncio.wait_for(response.write(data), WRITE_S)
     except asyncio.TimeoutError as error:
         if request.transport is not None:
             request.transport.abort()
-        raise ConnectionResetError("the client takes nothing") from error
+        raise ConnectionResetError("the client accepts no data") from error

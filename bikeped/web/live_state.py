@@ -1,9 +1,14 @@
-"""What the service does now, kept for whoever looks: the newest frame, the signal, the last alerts,
-the latencies of the last minutes. Keeping costs the loop microseconds; nothing here waits."""
+"""State of the live page: newest frame and signal, last alerts, latencies of the last two minutes.
+
+Updating it costs the loop microseconds and never waits.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import dataclasses
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,43 +19,25 @@ import numpy as np
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import fault_texts
 from bikeped.pipeline.frame_result import FrameResult
+from bikeped.telemetry.builders import finite_tracks, track_records
 from bikeped.telemetry.latency import STAGES
-from bikeped.types import Decision, Kind, PairMetrics, Signal, State
+from bikeped.telemetry.schema import EventTrack
+from bikeped.types import Decision, PairMetrics, Signal, State, Tracks
 
-#: Alerts that are remembered.
+#: Number of alerts kept.
 ALERTS = 20
 #: Seconds of latency history.
 TREND_S = 120
 
 
-class SeenTrack(msgspec.Struct, frozen=True):
-    """A track as the radar draws it; metres and metres per second, x forward, y right."""
+class LiveTrack(EventTrack, frozen=True, kw_only=True):
+    """A track as event lines have it, and for how long it has not been detected."""
 
-    id: int
-    kind: str
-    x: float
-    y: float
-    vx: float
-    vy: float
     unseen_s: float
 
 
-class SeenPair(msgspec.Struct, frozen=True):
-    """The figures that a pair was judged by, as `types.PairMetrics` has them."""
-
-    cyclist: int
-    pedestrian: int
-    distance_m: float
-    distance_then_m: float
-    lookback_s: float
-    displacement_m: float
-    speed_mps: float
-    d_min_m: float
-    d_max_m: float
-
-
 class LiveSnapshot(msgspec.Struct, frozen=True):
-    """What is known at this moment. Ages are seconds; None: nothing has come yet."""
+    """State at one moment, as sent to the page. Ages in seconds; None: nothing received yet."""
 
     number: int
     signal: str
@@ -59,21 +46,21 @@ class LiveSnapshot(msgspec.Struct, frozen=True):
     sentence: str
     decided: str | None
     faults: tuple[str, ...]
-    signal_age_s: float | None  #: since the light was last told something
+    signal_age_s: float | None  #: since the newest signal
     frame: int | None
-    frame_age_s: float | None  #: since the newest frame was judged
+    frame_age_s: float | None  #: since the newest result
     t_s: float | None
-    pair: SeenPair | None
-    tracks: tuple[SeenTrack, ...]
+    pair: dict[str, float] | None
+    tracks: list[LiveTrack]
 
 
 class AlertRecord(msgspec.Struct):
-    """One ALERT from its first frame to its last, with the figures that fired it."""
+    """One alert episode, with the pair's figures at its onset."""
 
     started_unix_s: float
-    ended_unix_s: float | None  #: None: it lasts
+    ended_unix_s: float | None  #: None: still active
     sentence: str
-    pair: SeenPair | None
+    pair: dict[str, float] | None
     nearest_m: float | None  #: of the pair, while the alert lasted
     frames: int
 
@@ -88,7 +75,7 @@ class TrendPoint(msgspec.Struct, frozen=True):
 
 
 class LiveState:
-    """An output and signal listener of the loop that remembers; `changed` waits for news."""
+    """Listens to results and signals; `wait_changed` waits for either."""
 
     def __init__(
         self,
@@ -97,12 +84,12 @@ class LiveState:
     ) -> None:
         self._clock, self._wall = clock, wall_clock
         self.result: FrameResult | None = None
-        self.signal_now: Signal | None = None
-        self.number = 0  #: grows with every piece of news
-        self.frames = 0  #: grows with every frame
+        self.signal: Signal | None = None
+        self.revision = 0  #: grows with every result and signal
+        self.frame_count = 0  #: results received
         self.alerts: deque[AlertRecord] = deque(maxlen=ALERTS)
         self._episodes = EpisodeTracker()
-        self.alerts_number = 0  #: grows whenever `alerts` changes
+        self.alerts_revision = 0  #: grows whenever `alerts` changes
         self.trend: deque[TrendPoint] = deque(maxlen=TREND_S)
         self.closed = False
         self._sentence = ""
@@ -111,46 +98,44 @@ class LiveState:
         self._frame_s: float | None = None
         self._second: int | None = None
         self._collected: list[Mapping[str, float]] = []
-        self._news = asyncio.Event()
+        self._changed = asyncio.Event()
 
     async def on_frame_result(self, result: FrameResult) -> None:
         self.result = result
         self._frame_s = self._clock()
-        self.frames += 1
+        self.frame_count += 1
         self._count_latency(result)
         self._follow_alert(result)
-        self._tell()
+        self._notify()
 
     def on_signal(self, signal: Signal, sentence: str, decision: Decision | None) -> None:
-        self.signal_now, self._sentence, self._decision = signal, sentence, decision
+        self.signal, self._sentence, self._decision = signal, sentence, decision
         self._signal_s = self._clock()
-        self._tell()
+        self._notify()
 
     def close(self) -> None:
-        """Ends all waiting: nothing more will come."""
+        """Ends all waiting."""
         self.closed = True
-        self._tell()
+        self._notify()
 
-    async def changed(self, since: int, timeout_s: float) -> None:
-        """Returns when there is news after number `since`, or after `timeout_s`."""
-        if self.number != since or self.closed:
+    async def wait_changed(self, since: int, timeout_s: float) -> None:
+        """Returns when `revision` is no longer `since`, or after `timeout_s`."""
+        if self.revision != since or self.closed:
             return
-        try:
-            await asyncio.wait_for(self._news.wait(), timeout_s)
-        except asyncio.TimeoutError:
-            return
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._changed.wait(), timeout_s)
 
-    async def next_frame(self, since: int) -> None:
-        """Returns when there is a frame after frame number `since`, or closed."""
-        while self.frames == since and not self.closed:
-            await self._news.wait()
+    async def wait_frame(self, since: int) -> None:
+        """Returns when `frame_count` is no longer `since`, or the state is closed."""
+        while self.frame_count == since and not self.closed:
+            await self._changed.wait()
 
     def snapshot(self) -> LiveSnapshot:
-        """Everything that a page shows of this moment."""
-        signal, result, now_s = self.signal_now, self.result, self._clock()
+        """The present state for the page."""
+        signal, result, now_s = self.signal, self.result, self._clock()
         decision = self._decision
         return LiveSnapshot(
-            number=self.number,
+            number=self.revision,
             signal="OFF" if signal is None else signal.name,
             colour="off" if signal is None else signal.colour.value,
             blink_hz=0.0 if signal is None else signal.blink_hz,
@@ -161,18 +146,18 @@ class LiveState:
             frame=None if result is None else result.decoded.frame.number,
             frame_age_s=None if self._frame_s is None else now_s - self._frame_s,
             t_s=None if result is None else result.t_s,
-            pair=None if result is None else _pair(result.tracking.decision.pair),
-            tracks=() if result is None else _tracks(result),
+            pair=None if result is None else _pair_record(result.tracking.decision.pair),
+            tracks=[] if result is None else _track_records(result.tracking.tracks),
         )
 
-    def _tell(self) -> None:
-        self.number += 1
-        self._news.set()
-        self._news = asyncio.Event()
+    def _notify(self) -> None:
+        self.revision += 1
+        self._changed.set()
+        self._changed = asyncio.Event()
 
     def _follow_alert(self, result: FrameResult) -> None:
         decision = result.tracking.decision
-        pair = _pair(decision.pair)
+        pair = _pair_record(decision.pair)
         change = self._episodes.update(decision.state is State.ALERT)
         if change == "begins":
             self.alerts.append(
@@ -181,7 +166,7 @@ class LiveState:
                     ended_unix_s=None,
                     sentence=decision.sentence,
                     pair=pair,
-                    nearest_m=None if pair is None else pair.distance_m,
+                    nearest_m=None if pair is None else pair["distance_m"],
                     frames=1,
                 )
             )
@@ -190,10 +175,11 @@ class LiveState:
         elif change == "lasts":
             last = self.alerts[-1]
             last.frames += 1
-            if pair is not None and (last.nearest_m is None or pair.distance_m < last.nearest_m):
-                last.nearest_m = pair.distance_m
+            if pair is not None:
+                nearest_m = math.inf if last.nearest_m is None else last.nearest_m
+                last.nearest_m = min(nearest_m, pair["distance_m"])
         if change in ("begins", "ends"):
-            self.alerts_number += 1
+            self.alerts_revision += 1
 
     def _count_latency(self, result: FrameResult) -> None:
         wall_s = self._wall()
@@ -210,43 +196,20 @@ def _trend_point(second: int, rows: list[Mapping[str, float]]) -> TrendPoint:
     p95: list[float | None] = []
     for stage in STAGES:
         values = [row[stage] for row in rows if stage in row]
-        if values:
-            middle, high = np.percentile(values, (50, 95)).tolist()
-            p50.append(round(middle, 2))
-            p95.append(round(high, 2))
-        else:
-            p50.append(None)
-            p95.append(None)
+        for column, percent in ((p50, 50), (p95, 95)):
+            column.append(round(float(np.percentile(values, percent)), 2) if values else None)
     return TrendPoint(float(second), len(rows), tuple(p50), tuple(p95))
 
 
-def _pair(pair: PairMetrics | None) -> SeenPair | None:
+def _pair_record(pair: PairMetrics | None) -> dict[str, float] | None:
+    """`PairMetrics` by field name, the ids as `cyclist` and `pedestrian`."""
     if pair is None:
         return None
-    return SeenPair(
-        cyclist=pair.cyclist_id,
-        pedestrian=pair.pedestrian_id,
-        distance_m=round(pair.distance_m, 3),
-        distance_then_m=round(pair.distance_then_m, 3),
-        lookback_s=round(pair.lookback_s, 4),
-        displacement_m=round(pair.displacement_m, 3),
-        speed_mps=round(pair.speed_mps, 3),
-        d_min_m=round(pair.d_min_m, 3),
-        d_max_m=round(pair.d_max_m, 3),
-    )
+    values = dataclasses.asdict(pair).items()
+    return {name.removesuffix("_id"): round(value, 4) for name, value in values}
 
 
-def _tracks(result: FrameResult) -> tuple[SeenTrack, ...]:
-    tracks = result.tracking.tracks
-    rows = zip(
-        tracks.id.tolist(),
-        tracks.kind.tolist(),
-        tracks.xy_m.round(3).tolist(),
-        tracks.velocity_mps.round(3).tolist(),
-        tracks.unseen_s.round(2).tolist(),
-        strict=True,
-    )
-    return tuple(
-        SeenTrack(number, Kind(kind).label, xy[0], xy[1], velocity[0], velocity[1], unseen)
-        for number, kind, xy, velocity, unseen in rows
-    )
+def _track_records(tracks: Tracks) -> list[LiveTrack]:
+    tracks = finite_tracks(tracks)
+    rows = zip(track_records(tracks), tracks.unseen_s.round(2).tolist(), strict=True)
+    return [LiveTrack(**msgspec.structs.asdict(track), unseen_s=unseen) for track, unseen in rows]

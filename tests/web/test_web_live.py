@@ -162,18 +162,18 @@ async def test_alerts_are_kept_with_their_numbers_and_bounded():
     assert len(state.alerts) == 1
     (alert,) = state.alerts
     assert alert.pair is not None
-    assert alert.nearest_m < alert.pair.distance_m  # the cyclist came nearer
+    assert alert.nearest_m < alert.pair["distance_m"]  # the cyclist came nearer
     assert alert.sentence.startswith("ALERT: ")
     assert alert.frames > 10
     assert alert.ended_unix_s is None
-    number = state.alerts_number
+    number = state.alerts_revision
     for _ in range(3 * ALERTS):
         page.web_context.track_and_decide.reset()
         page.scene = Scene(page.web_context.track_and_decide)
         for _ in range(6):
             await page.show()
     assert len(state.alerts) == ALERTS
-    assert state.alerts_number > number
+    assert state.alerts_revision > number
     assert all(alert.ended_unix_s is not None for alert in list(state.alerts)[:-1])
 
 
@@ -241,19 +241,19 @@ async def test_nothing_is_drawn_while_nobody_looks(make_page):
     page = await make_page("web.stream_fps=30")
     for _ in range(5):
         await page.show()
-    assert page.live.renderer.drawn == 0
+    assert page.live.renderer.number == 0
     async with aiohttp.ClientSession() as session:
         async with session.get(f"{page.url}/live/stream") as answer:
             await Pictures(answer).next()
         # The visitor leaves; as soon as the server learns of it, the drawing ends.
-        while page.live.renderer._painting is not None:
+        while page.live.renderer._drawing is not None:
             await page.show()
             await asyncio.sleep(0.01)
-        drawn = page.live.renderer.drawn
+        drawn = page.live.renderer.number
         for _ in range(20):
             await page.show()
             await asyncio.sleep(0.01)
-        assert page.live.renderer.drawn == drawn
+        assert page.live.renderer.number == drawn
 
 
 async def test_many_lookers_share_one_drawing(make_page):
@@ -263,7 +263,7 @@ async def test_many_lookers_share_one_drawing(make_page):
         answers = [await session.get(f"{page.url}/live/stream") for _ in range(5)]
         for answer in answers:
             await Pictures(answer).next()
-        assert page.live.renderer.drawn == 1
+        assert page.live.renderer.number == 1
         for answer in answers:
             answer.close()
 
@@ -279,7 +279,7 @@ async def test_a_damaged_frame_is_a_picture_less_and_no_more(make_page, caplog):
             await page.show()
             await asyncio.sleep(0.01)
         assert (await waiting).shape == (640, 960, 3)
-    assert "paint" in caplog.text
+    assert "picture" in caplog.text
 
 
 # --- caps, and slow clients
@@ -327,8 +327,8 @@ async def test_a_client_that_reads_nothing_holds_nobody_up(make_page, monkeypatc
         pictures = Pictures(answer)
         waiting = asyncio.create_task(pictures.next())
         # Until both lazy streams are let go, frames are taken as ever, and the eager one sees them.
-        while page.live._streams > 1 or page.state.frames < 60:
-            at_once(page.show(grey=int(page.state.frames) % 200))
+        while page.live._streams > 1 or page.state.frame_count < 60:
+            at_once(page.show(grey=int(page.state.frame_count) % 200))
             if waiting.done():
                 await waiting
                 waiting = asyncio.create_task(pictures.next())
@@ -367,7 +367,7 @@ class Probe(ServicePages):
 
     async def on_frame_result(self, result: Any) -> None:
         await super().on_frame_result(result)
-        if self.state.frames == 3:
+        if self.state.frame_count == 3:
             self.found = await self._visit("", self.app)
 
 

@@ -338,7 +338,7 @@ def test_who_does_not_look_costs_nothing(told, open_page, until):
         "document.dispatchEvent(new Event('visibilitychange'))"
     )
     gone()
-    assert told.live.renderer._painting is None
+    assert told.live.renderer._drawing is None
     page.evaluate(
         "Object.defineProperty(document, 'hidden', {get: () => false, configurable: true});"
         "document.dispatchEvent(new Event('visibilitychange'))"
