@@ -209,7 +209,7 @@ class Told:
     def show_frame(self, count: int = 1) -> None:
         async def show() -> None:
             for _ in range(count):
-                await self.state.frame(self.scene.next())
+                await self.state.on_frame_result(self.scene.next())
 
         asyncio.run_coroutine_threadsafe(show(), self.served.loop).result(PATIENCE_S)
 
