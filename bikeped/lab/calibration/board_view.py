@@ -1,4 +1,4 @@
-"""What the corner finder hands to the adjustment: a board, and where its corners were seen.
+"""The board's pattern, and where its corners were detected in each image.
 
 Pixels have their origin in the middle of the top left pixel (OpenCV's convention), u right, v down.
 """
@@ -25,6 +25,9 @@ class BoardPattern:
     rows: int
     square_m: float = 1.0
 
+    def __str__(self) -> str:
+        return f"{self.columns}x{self.rows}"
+
     @property
     def count(self) -> int:
         return self.columns * self.rows
@@ -40,9 +43,9 @@ class BoardPattern:
 
 @dataclass(frozen=True)
 class BoardView:
-    """One picture's corners: `ids` [n] ascending and unique, `uv_px` [n, 2]; n may be partial."""
+    """One image's corners: `ids` [n] ascending and unique, `uv_px` [n, 2]; n may be partial."""
 
-    name: str  #: of the picture, for people: a file's path, or frame 120 of a video
+    name: str  #: the image's path, or `clip.mp4 frame 120`
     ids: IntArray
     uv_px: FloatArray
     width: int
@@ -59,19 +62,19 @@ class BoardView:
 
 
 @dataclass(frozen=True)
-class Refused:
-    """A picture that is not used, and why, in words for the person who took it."""
+class RefusedImage:
+    """An image that is not used: its file (or `clip.mp4 frame 120`), and the reason."""
 
-    name: str
-    why: str
+    file: str
+    reason: str
 
 
 @dataclass(frozen=True)
-class Found:
-    """What was found in a set of pictures of one size."""
+class DetectedBoards:
+    """The boards of a set of images of one size, and the images without one."""
 
     pattern: BoardPattern
     views: Sequence[BoardView]
-    refused: Sequence[Refused]
-    pictures: int  #: looked at, refused ones included
-    pictures_hash: str  #: SHA-256 over the pictures' bytes, in order of name
+    refused: Sequence[RefusedImage]
+    images: int  #: of the set, refused ones included
+    images_hash: str  #: SHA-256 over the images' bytes, in order of name

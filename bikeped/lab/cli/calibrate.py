@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from bikeped.cli.common import FiniteRange, config_options, console, json_option
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.errors import require
-from bikeped.lab.cli.calibrate_options import PATTERN, Asked
+from bikeped.errors import BikepedError, require
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.cli.calibrate_options import CalibrateOptions, PatternType
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _MODELS = ("equidistant", "equisolid", "stereographic", "orthographic", "linear", "equalarea")
 _DEFAULT_OUT = Path("camera_calibration.json")
@@ -20,7 +26,7 @@ _DEFAULT_OUT = Path("camera_calibration.json")
 @click.argument("images", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
     "--pattern",
-    type=PATTERN,
+    type=PatternType(),
     metavar="COLUMNSxROWS",
     help="Inner corners of the board, where four squares meet, e.g. 8x6.",
 )
@@ -59,7 +65,7 @@ _DEFAULT_OUT = Path("camera_calibration.json")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="Calibration file; what it held is kept as FILE.bak. Default: camera_calibration.json "
+    help="Calibration file; an existing one is kept as FILE.bak. Default: camera_calibration.json "
     "in this folder, unless it exists.",
 )
 @click.option(
@@ -107,40 +113,76 @@ def command(
     Sensor frames (camera.width x camera.height) are calibrated in the square crop that the
     configuration describes, pictures of any other size as they are.
     """
+    if pattern is None:
+        raise BikepedError(
+            "--pattern: missing; count the corners where four squares meet and give COLUMNSxROWS, "
+            "e.g. --pattern 8x6"
+        )
+    board = BoardPattern(*pattern, square_m or 1.0)
+    screen = console(json_path)
+    if board_path is not None:
+        _write_board(board_path, board, page, screen)
+        return 0
     # The matrices are small: a second thread costs more than it does, some twenty times over. The
     # libraries read this once, when they are loaded.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    require("scipy", extra="calibrate")
-    from bikeped.lab.cli.calibrate_capture import live_pictures, write_board
-    from bikeped.lab.cli.calibrate_run import run
+    require("scipy", "threadpoolctl", extra="calibrate")
+    if report_path is not None:
+        require("matplotlib", extra="calibrate")
+    _check_outputs(images, config_path, out or _DEFAULT_OUT, report_path, json_path)
+    from bikeped.lab.cli.calibrate_capture import live_pictures
+    from bikeped.lab.cli.calibrate_run import camera_config, images_of, run, write_outputs
     from bikeped.lab.cli.calibrate_tables import print_result
 
-    if report_path is not None:
-        require("matplotlib")
-    target = out or _DEFAULT_OUT
-    if board_path is None:
-        lens = [(f"{target}, the lens,", target)]
-        if out is not None and target.exists():
-            lens.append((f"{target}.bak, the former lens,", target.with_name(target.name + ".bak")))
-        others = (("--report", report_path), ("--json", json_path))
-        named = [(name, path) for name, value in others for path in written_paths(value)]
-        check_outputs(
-            [("IMAGES", path) for path in images]
-            + ([("-c", config_path)] if config_path is not None else []),
-            lens + named,
-        )
-    screen = console(json_path)
-    asked = Asked.of(pattern, square_m, model, terms, board_shape, compare, folds or 0)
-    if board_path is not None:
-        write_board(board_path, asked.pattern, page, screen)
-        return 0
-    if live:
-        images = live_pictures(images, asked.pattern, config_path, overrides, screen)
-    done = run(images, asked, config_path, overrides)
-    written = done.write(report_path, json_path, out, _DEFAULT_OUT)
+    number = None if terms is None else int(terms)
+    options = CalibrateOptions(board, model, number, board_shape, compare, folds or 0)
+    try:
+        loaded = camera_config(config_path, overrides)
+        if live:
+            images = live_pictures(images, board, loaded, screen)
+        pictures = images_of(images)
+        result = run(pictures, options, loaded)
+        written = write_outputs(result, pictures, report_path, json_path, out, _DEFAULT_OUT)
+    except KeyboardInterrupt:
+        click.echo("bikeped: interrupted", err=True)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # another Ctrl-C ends it without a trace
+        raise click.exceptions.Exit(130) from None
     if json_path != "-":
-        print_result(screen, done)
+        print_result(screen, result, compare)
         for line in written:
             click.echo(line)
     return 0
+
+
+def _check_outputs(
+    images: tuple[Path, ...],
+    config_path: Path | None,
+    out: Path,
+    report_path: Path | None,
+    json_path: str | None,
+) -> None:
+    """Also checks the default calibration file and its backup, which `guarded` does not know."""
+    outputs = [(f"{out}, the lens,", out)]
+    if out.exists():
+        outputs.append((f"{out}.bak, the former lens,", out.with_name(out.name + ".bak")))
+    for name, value in (("--report", report_path), ("--json", json_path)):
+        outputs += [(name, path) for path in written_paths(value)]
+    inputs = [("IMAGES", path) for path in images]
+    check_outputs(inputs + [("-c", path) for path in written_paths(config_path)], outputs)
+
+
+def _write_board(path: Path, pattern: BoardPattern, page: str, screen: Console) -> None:
+    from rich.markup import escape
+
+    from bikeped.lab.calibration.capture.board_pdf import write_board_pdf
+
+    square_m = write_board_pdf(path, pattern, page=page)
+    screen.print(
+        f"wrote {escape(str(path))}: {pattern} inner corners, squares of {square_m * 1000:g} mm on "
+        f"{page.upper()}"
+    )
+    screen.print(
+        "print it at 100 % (no fitting to the page), hold a ruler against the printed one, glue it "
+        f"onto something stiff; then --pattern {pattern} --square METRES as measured"
+    )

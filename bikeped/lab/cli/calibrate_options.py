@@ -1,4 +1,4 @@
-"""What `bikeped calibrate` was asked for."""
+"""The board and the models that `bikeped calibrate` was given."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any
 
 import click
 
-from bikeped.errors import BikepedError
 from bikeped.lab.calibration.board_view import BoardPattern
 
 #: A board needs corners in two directions, and no printed one has more.
 _FEWEST, _MOST = 3, 60
 
 
-class _Pattern(click.ParamType):  # type: ignore[type-arg]
+class PatternType(click.ParamType):  # type: ignore[type-arg]
+    """Inner corners as `COLUMNSxROWS`."""
+
     name = "pattern"
 
     def convert(
@@ -35,48 +36,19 @@ class _Pattern(click.ParamType):  # type: ignore[type-arg]
         return sides
 
 
-PATTERN = _Pattern()
-
-
 @dataclass(frozen=True)
-class Asked:
-    """Board and models; `model` and `terms` None: what --compare recommends, or the defaults."""
+class CalibrateOptions:
+    """Board and models; `model` and `terms` None: as `--compare` recommends, or the defaults."""
 
-    columns: int
-    rows: int
-    square_m: float | None
+    pattern: BoardPattern
     model: str | None
     terms: int | None
     board_shape: bool
     compare: bool
-    folds: int
-
-    @staticmethod
-    def of(
-        pattern: tuple[int, int] | None,
-        square_m: float | None,
-        model: str | None,
-        terms: str | None,
-        board_shape: bool,
-        compare: bool,
-        folds: int,
-    ) -> Asked:
-        """BikepedError when the board is not described."""
-        if pattern is None:
-            raise BikepedError(
-                "--pattern: missing; count the corners where four squares meet and give "
-                "COLUMNSxROWS, e.g. --pattern 8x6"
-            )
-        number = None if terms is None else int(terms)
-        return Asked(*pattern, square_m, model, number, board_shape, compare, folds)
+    folds: int  #: 0: each image is a fold
 
     @property
-    def pattern(self) -> BoardPattern:
-        """The board; squares of 1 where none were measured."""
-        return BoardPattern(self.columns, self.rows, self.square_m or 1.0)
-
-    @property
-    def free_to_choose(self) -> bool:
-        """Whether the recommended model is to be written."""
+    def writes_recommended(self) -> bool:
+        """Whether the recommended model is written."""
         open_model = self.model is None and self.terms is None and not self.board_shape
         return self.compare and open_model

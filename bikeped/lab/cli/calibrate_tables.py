@@ -1,7 +1,8 @@
-"""What `bikeped calibrate` says to people."""
+"""The console output of `bikeped calibrate`."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,100 +10,100 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bikeped.lab.calibration.solver.compare import paper_criterion
-from bikeped.lab.calibration.solver.lens_fit import Fit
-from bikeped.lab.calibration.solver.lens_model import Sightings
-from bikeped.lab.cli.calibrate_run import Done
+from bikeped.cli.common import text_table
+from bikeped.lab.calibration.report.results import CalibrationResult
+from bikeped.lab.calibration.solver.lens_model import CornerObservations
+from bikeped.lab.calibration.solver.model_comparison import paper_criterion
 
 _MOST_NAMED = 8
 
 
-def print_result(screen: Console, done: Done) -> None:
-    """Boards, models, the choice, and what to mind."""
-    calibrated, prepared = done.calibrated, done.calibrated.prepared
-    sightings = prepared.sightings
+def print_result(screen: Console, result: CalibrationResult, compare: bool) -> None:
+    """Boards, models, the recommendation, and cautions."""
+    prepared, chosen = result.comparison.prepared, result.chosen
+    observations = prepared.observations
+    size = f"{observations.width} x {observations.height}"
     where = (
-        f"in the {sightings.width} x {sightings.height} crop"
-        if done.framing is not None
-        else f"pictures of {sightings.width} x {sightings.height}, taken as they are"
+        f"pictures of {size}, taken as they are"
+        if result.framing is None
+        else f"in the {size} crop"
     )
-    screen.print(
-        f"{len(sightings)} of {prepared.boards_total} boards, {int(sightings.seen.sum())} corners, "
-        f"{where}"
-    )
-    for line in in_part(sightings):
-        screen.print(line)
-    for refused in calibrated.refused[:_MOST_NAMED]:
-        screen.print(f"  not used: {escape(Path(refused.name).name)}: {escape(refused.why)}")
-    if len(calibrated.refused) > _MOST_NAMED:
-        screen.print(f"  and {len(calibrated.refused) - _MOST_NAMED} more (--json, --report)")
-    for corner in calibrated.left_out[:_MOST_NAMED]:
-        screen.print(
-            f"  left out: corner {corner.corner} of {escape(Path(corner.name).name)}, "
-            f"{corner.off_px:.1f} px off"
-        )
-    if len(calibrated.left_out) > _MOST_NAMED:
-        screen.print(f"  and {len(calibrated.left_out) - _MOST_NAMED} more corners")
-    screen.print(_table(done))
-    if done.asked.compare:
-        screen.print(f"recommended: {done.recommendation.why}")
-        screen.print(paper_criterion(calibrated))
-    k = done.chosen.state.terms[: done.chosen.model.terms]
-    terms = "".join(f", k{n + 1} = {value:.6g}" for n, value in enumerate(k))
-    screen.print(f"{done.chosen.name}{terms}")
-    screen.print(f"field of view {done.field.fov_deg:.1f} degrees; ends at {done.field.ends_at}")
-    for caution in done.cautions:
-        screen.print(f"mind: {escape(caution)}")
-
-
-def in_part(sightings: Sightings) -> list[str]:
-    """A line for each board of which some corners are not used, the emptiest first."""
-    whole, counts = sightings.pattern.count, sightings.seen.sum(1)
-    rows = [int(row) for row in np.argsort(counts, kind="stable") if counts[row] < whole]
+    corners = int(observations.visible.sum())
     lines = [
-        f"  in part: {escape(Path(sightings.names[row]).name)}, {counts[row]} of {whole} corners"
-        for row in rows[:_MOST_NAMED]
+        f"{len(observations)} of {prepared.images} boards, {corners} corners, {where}",
+        *partial_board_lines(observations),
+        *_first(
+            (f"  not used: {_name(r.file)}: {escape(r.reason)}" for r in prepared.refused),
+            "more (--json, --report)",
+        ),
+        *_first(
+            (
+                f"  left out: corner {c.corner} of {_name(c.file)}, {c.off_px:.1f} px off"
+                for c in prepared.outliers
+            ),
+            "more corners",
+        ),
     ]
-    if len(rows) > _MOST_NAMED:
-        lines.append(f"  and {len(rows) - _MOST_NAMED} more boards in part (--json, --report)")
-    return lines
-
-
-def _table(done: Done) -> Table:
-    table = Table(
-        title=f"error in px; cross-validated: {_dealt(done)}",
-        title_justify="left",
-        box=None,
-        pad_edge=False,
+    for line in lines:
+        screen.print(line)
+    screen.print(_table(result))
+    if compare:
+        screen.print(f"recommended: {result.recommendation.reason}")
+        screen.print(paper_criterion(result.comparison))
+    k = chosen.state.terms[: chosen.model.terms]
+    terms = "".join(f", k{n + 1} = {value:.6g}" for n, value in enumerate(k))
+    screen.print(f"{chosen.name}{terms}")
+    screen.print(
+        f"field of view {result.field.fov_deg:.1f} degrees; ends at {result.field.ends_at}"
     )
-    table.add_column("model")
-    for name in ("cross-validated", "RMS per point", "per coordinate", "f", "cx", "cy"):
-        table.add_column(name, justify="right")
-    for fit in sorted(done.calibrated.fits.values(), key=_error):
-        held = fit.cross_validated_px
-        sigma = fit.uncertainty
-        mark = " *" if fit is done.chosen else ""
-        table.add_row(
-            fit.name + mark,
-            "-" if held is None else f"{held:.4f}",
-            f"{fit.rms_px:.4f}",
-            f"{fit.rms_per_coordinate_px:.4f}",
-            f"{fit.focal_px:.3f} ± {sigma['f']:.3f}",
-            f"{fit.cx:.2f} ± {sigma['cx']:.2f}",
-            f"{fit.cy:.2f} ± {sigma['cy']:.2f}",
-        )
-    if len(done.calibrated.fits) > 1:
-        table.caption = "* goes into the calibration file"
-        table.caption_justify = "left"
-    return table
+    for caution in result.cautions:
+        screen.print(f"caution: {escape(caution)}")
 
 
-def _dealt(done: Done) -> str:
-    folds = done.calibrated.folds
-    if folds == len(done.calibrated.prepared.sightings):
-        return "each picture from all others"
-    return f"each of {folds} folds from the others"
+def partial_board_lines(observations: CornerObservations) -> list[str]:
+    """A line for each board of which some corners are not used, the emptiest first."""
+    whole, counts = observations.pattern.count, observations.visible.sum(1)
+    rows = [int(row) for row in np.argsort(counts, kind="stable") if counts[row] < whole]
+    return _first(
+        (
+            f"  in part: {_name(observations.names[n])}, {counts[n]} of {whole} corners"
+            for n in rows
+        ),
+        "more boards in part (--json, --report)",
+    )
 
 
-def _error(fit: Fit) -> float:
-    return fit.cross_validated_px or fit.rms_px
+def _first(lines: Iterable[str], what: str) -> list[str]:
+    """The first few lines, and one that counts the others."""
+    every = list(lines)
+    more = len(every) - _MOST_NAMED
+    return every[:_MOST_NAMED] + ([f"  and {more} {what}"] if more > 0 else [])
+
+
+def _name(file: str) -> str:
+    return escape(Path(file).name)
+
+
+def _table(result: CalibrationResult) -> Table:
+    fits, folds = result.comparison.ranked, result.comparison.folds
+    every_image = folds == len(result.comparison.prepared.observations)
+    how = (
+        "each picture from all others" if every_image else f"each of {folds} folds from the others"
+    )
+    return text_table(
+        ("model", "cross-validated", "RMS per point", "per coordinate", "f", "cx", "cy"),
+        [
+            (
+                fit.name + (" *" if fit is result.chosen else ""),
+                "-" if fit.cross_validated_px is None else f"{fit.cross_validated_px:.4f}",
+                f"{fit.rms_px:.4f}",
+                f"{fit.rms_per_coordinate_px:.4f}",
+                f"{fit.focal_px:.3f} ± {fit.uncertainty['f']:.3f}",
+                f"{fit.cx:.2f} ± {fit.uncertainty['cx']:.2f}",
+                f"{fit.cy:.2f} ± {fit.uncertainty['cy']:.2f}",
+            )
+            for fit in fits
+        ],
+        title=f"error in px; cross-validated: {how}",
+        note="* goes into the calibration file" if len(fits) > 1 else "",
+    )

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import pytest
+from synthetic_boards import BoardBend, DrawnCamera, draw_views, spread_poses
 
 from bikeped.geometry import Lens
 from bikeped.geometry.lens import Projection
-from bikeped.lab.calibration.board_view import BoardPattern, BoardView, Found, Refused
-from bikeped.lab.calibration.synthetic import BoardBend, DrawnCamera, draw_views, spread_poses
+from bikeped.lab.calibration.board_view import BoardPattern, BoardView, DetectedBoards, RefusedImage
+from bikeped.lab.calibration.refusals import BoardRefusedError
 
 PATTERN = BoardPattern(8, 6, 0.1)
 FLAT = BoardBend()
@@ -49,6 +52,13 @@ def boards(
     )
 
 
-def found(views: Sequence[BoardView], refused: Sequence[Refused] = ()) -> Found:
+def refusal_of(detect: Callable[..., object], *arguments: object) -> str:
+    """The reason for which a detector refuses an image."""
+    with pytest.raises(BoardRefusedError) as caught:
+        detect(*arguments)
+    return caught.value.reason
+
+
+def found(views: Sequence[BoardView], refused: Sequence[RefusedImage] = ()) -> DetectedBoards:
     """As the corner finder hands them over."""
-    return Found(PATTERN, views, refused, len(views) + len(refused), "0" * 64)
+    return DetectedBoards(PATTERN, views, refused, len(views) + len(refused), "0" * 64)

@@ -8,14 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import PATTERN, boards, camera, found
-
-from bikeped.errors import CalibrationError
-from bikeped.geometry import Framing, Lens
-from bikeped.lab.calibration.board_view import BoardView, Refused
-from bikeped.lab.calibration.solver.compare import calibrate
-from bikeped.lab.calibration.solver.lens_model import Model
-from bikeped.lab.calibration.solver.observations import cropped, prepare
-from bikeped.lab.calibration.synthetic import (
+from synthetic_boards import (
     BoardPose,
     DrawnCamera,
     draw_views,
@@ -23,17 +16,26 @@ from bikeped.lab.calibration.synthetic import (
     turn,
 )
 
+from bikeped.errors import CalibrationError
+from bikeped.geometry import Framing, Lens
+from bikeped.lab.calibration.board_view import BoardView, RefusedImage
+from bikeped.lab.calibration.image_pipeline import crop_view
+from bikeped.lab.calibration.refusals import BoardRefusedError
+from bikeped.lab.calibration.solver.lens_model import LensModel
+from bikeped.lab.calibration.solver.model_comparison import fit_models
+from bikeped.lab.calibration.solver.observations import prepare_observations
 
-def refusal(views: list[BoardView], refused: tuple[Refused, ...] = ()) -> str:
+
+def refusal(views: list[BoardView], refused: tuple[RefusedImage, ...] = ()) -> str:
     with pytest.raises(CalibrationError) as caught:
-        prepare(found(views, refused))
+        prepare_observations(found(views, refused))
     text = str(caught.value)
     assert "\n" not in text
     return text
 
 
 def test_no_board() -> None:
-    text = refusal([], (Refused("a.jpg", "no board"), Refused("b.jpg", "no board")))
+    text = refusal([], (RefusedImage("a.jpg", "no board"), RefusedImage("b.jpg", "no board")))
     assert "no board of 8x6" in text
     assert "in 2 pictures" in text
     assert "--pattern" in text
@@ -58,9 +60,9 @@ def test_boards_that_face_the_lens_leave_its_focal_length_open() -> None:
         for n in range(6)
     ]
     views = draw_views(drawn, PATTERN, poses, noise_px=0.3, seed=3)
-    prepared = prepare(found(views))
+    prepared = prepare_observations(found(views))
     with pytest.raises(CalibrationError, match="focal length open"):
-        calibrate(prepared, [Model("equidistant", 2)], 3)
+        fit_models(prepared, [LensModel("equidistant", 2)], 3)
 
 
 @pytest.mark.parametrize("half_deg", [25.0, 40.0])
@@ -76,17 +78,17 @@ def test_an_ordinary_lens(half_deg: float) -> None:
 def test_a_narrow_fisheye_is_still_one(projection: str) -> None:
     drawn = camera(projection, 70.0, size=1000)  # type: ignore[arg-type]
     views = boards(drawn, 12, span_deg=(20.0, 35.0), noise_px=0.2)
-    assert len(prepare(found(views)).sightings) == 12
+    assert len(prepare_observations(found(views)).observations) == 12
 
 
 def test_a_board_that_contradicts_the_others_is_named() -> None:
     views = boards(camera(size=1000), 12)
     rng = np.random.default_rng(4)
     views[5] = replace(views[5], uv_px=rng.permutation(views[5].uv_px))
-    prepared = prepare(found(views))
-    assert [r.name for r in prepared.refused] == [views[5].name]
-    assert "do not fit the other boards" in prepared.refused[0].why
-    assert len(prepared.sightings) == 11
+    prepared = prepare_observations(found(views))
+    assert [r.file for r in prepared.refused] == [views[5].name]
+    assert "do not fit the other boards" in prepared.refused[0].reason
+    assert len(prepared.observations) == 11
 
 
 def test_corners_that_are_nothing_but_noise() -> None:
@@ -103,14 +105,15 @@ def test_sensor_frames_are_calibrated_in_the_crop() -> None:
     uv = np.array([[170.0 + n, 500.0] for n in range(12)] + [[100.0, 9.0]] * 3)
     view = BoardView("a", np.arange(15), uv, 3840, 2160)
     lost = BoardView("b", np.arange(15), uv * 0 + 20, 3840, 2160)
-    out = cropped(found([view, lost]), framing)
-    assert [v.name for v in out.views] == ["a"]
-    assert (out.views[0].width, out.views[0].height) == (3500, 3500)
-    np.testing.assert_allclose(out.views[0].uv_px[0], [0.0, 500 + 670])
-    assert len(out.views[0]) == 12  # what lies outside the crop is not used
-    assert [r.name for r in out.refused] == ["b"]
+    out = crop_view(view, framing)
+    assert out.name == "a"
+    assert (out.width, out.height) == (3500, 3500)
+    np.testing.assert_allclose(out.uv_px[0], [0.0, 500 + 670])
+    assert len(out) == 12  # what lies outside the crop is not used
+    with pytest.raises(BoardRefusedError, match="lies outside the square crop"):
+        crop_view(lost, framing)
 
 
 def test_pictures_of_another_size_are_taken_as_they_are() -> None:
-    views = boards(camera(size=1000), 3)
-    assert cropped(found(views), Framing(3840, 2160, 3840, 3500)).views == views
+    for view in boards(camera(size=1000), 3):
+        assert crop_view(view, Framing(3840, 2160, 3840, 3500)) is view

@@ -8,50 +8,53 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import boards, camera, found
+from synthetic_boards import BoardBend
 
 from bikeped.geometry.lens import Projection, unit_radius
-from bikeped.lab.calibration.report.calibration_file import field_of_view
-from bikeped.lab.calibration.report.results import result_data
-from bikeped.lab.calibration.solver.compare import (
-    Calibrated,
-    calibrate,
-    models_to_compare,
-    paper_criterion,
-    recommend,
-    start_for,
-)
+from bikeped.lab.calibration.capture.coverage import Coverage
+from bikeped.lab.calibration.report.field_of_view import field_of_view
+from bikeped.lab.calibration.report.results import CalibrationResult, result_data
 from bikeped.lab.calibration.solver.initial_guess import FISHEYE
-from bikeped.lab.calibration.solver.lens_fit import Fit
-from bikeped.lab.calibration.solver.lens_model import Model, angles, camera_points
-from bikeped.lab.calibration.solver.observations import prepare
-from bikeped.lab.calibration.synthetic import BoardBend
+from bikeped.lab.calibration.solver.lens_fit import LensFit
+from bikeped.lab.calibration.solver.lens_model import LensModel, corner_angles
+from bikeped.lab.calibration.solver.model_comparison import (
+    ModelComparison,
+    comparison_models,
+    fit_models,
+    initial_state,
+    paper_criterion,
+    recommend_model,
+)
+from bikeped.lab.calibration.solver.observations import prepare_observations
 
 WINDOW = (0.0, 0.0, 1000.0, 1000.0)
 
 
 @pytest.fixture(scope="module")
-def bent() -> Calibrated:
+def bent() -> ModelComparison:
     """An equisolid lens with radial terms, and a bent board."""
     drawn = camera("equisolid", 95.0, (0.02, -0.012, 0.004, -0.0006), size=1000)
     views = boards(drawn, 14, noise_px=0.1, bend=BoardBend(0.03, -0.02, 0.01))
-    prepared = prepare(found(views))
-    return calibrate(prepared, models_to_compare(Model("equisolid", 4)), 4)
+    prepared = prepare_observations(found(views))
+    return fit_models(prepared, comparison_models(LensModel("equisolid", 4)), 4)
 
 
-def held(f: Fit) -> float:
+def held(f: LensFit) -> float:
     assert f.cross_validated_px is not None
     return f.cross_validated_px
 
 
-def test_all_models_are_compared_and_have_the_names_that_people_rely_on(bent: Calibrated) -> None:
+def test_all_models_are_compared_and_have_the_names_that_people_rely_on(
+    bent: ModelComparison,
+) -> None:
     fixed = {*FISHEYE, "equidistant+k2", "equidistant+k4", "equidistant+k4+board"}
     assert fixed <= set(bent.fits)
     assert {"equisolid+k4", "equisolid+k4+board", "orthographic+k2"} <= set(bent.fits)
     assert all(f.name == name for name, f in bent.fits.items())
-    assert len({int(f.sightings.seen.sum()) for f in bent.fits.values()}) == 1
+    assert len({int(f.observations.visible.sum()) for f in bent.fits.values()}) == 1
 
 
-def test_more_freedom_fits_better_and_the_board_matters_most(bent: Calibrated) -> None:
+def test_more_freedom_fits_better_and_the_board_matters_most(bent: ModelComparison) -> None:
     fits = bent.fits
     for projection in ("equidistant", "equisolid"):
         assert fits[projection].rms_px > fits[f"{projection}+k2"].rms_px
@@ -64,12 +67,12 @@ def test_more_freedom_fits_better_and_the_board_matters_most(bent: Calibrated) -
 @pytest.mark.parametrize("projection", FISHEYE)
 def test_a_plain_lens_is_recommended_as_what_it_is(projection: Projection) -> None:
     drawn = camera(projection, 80.0, size=1000)
-    prepared = prepare(found(boards(drawn, 10, noise_px=0.3)))
-    done = calibrate(prepared, [Model(p, t) for t in (0, 2) for p in FISHEYE], 5)
+    prepared = prepare_observations(found(boards(drawn, 10, noise_px=0.3)))
+    done = fit_models(prepared, [LensModel(p, t) for t in (0, 2) for p in FISHEYE], 5)
     assert next(iter(done.one_parameter)) == projection
-    told = recommend(done)
+    told = recommend_model(done)
     assert told.name == projection
-    assert projection in told.why
+    assert projection in told.reason
     sentence = paper_criterion(done)
     if projection == "equidistant":
         assert "the equidistant model is the best" in sentence
@@ -77,7 +80,7 @@ def test_a_plain_lens_is_recommended_as_what_it_is(projection: Projection) -> No
         assert f"worse than {projection}" in sentence
 
 
-def with_errors(done: Calibrated, errors: dict[str, float]) -> Calibrated:
+def with_errors(done: ModelComparison, errors: dict[str, float]) -> ModelComparison:
     """The same fits with other held-out errors."""
     fits = {
         name: replace(
@@ -101,32 +104,35 @@ def with_errors(done: Calibrated, errors: dict[str, float]) -> Calibrated:
     ],
 )
 def test_the_simplest_within_two_per_cent_is_recommended(
-    bent: Calibrated, errors: dict[str, float], chosen: str
+    bent: ModelComparison, errors: dict[str, float], chosen: str
 ) -> None:
-    told = recommend(with_errors(bent, errors))
+    told = recommend_model(with_errors(bent, errors))
     assert told.name == chosen
-    assert told.why.startswith(chosen)
-    assert told.why.endswith(".")
+    assert told.reason.startswith(chosen)
+    assert told.reason.endswith(".")
 
 
-def test_a_start_for_another_model_keeps_the_radii(bent: Calibrated) -> None:
+def test_a_start_for_another_model_keeps_the_radii(bent: ModelComparison) -> None:
     prepared = bent.prepared
-    state = prepared.start
-    theta = angles(camera_points(state, prepared.sightings.flat))[prepared.sightings.seen]
-    other = start_for(Model("equidistant", 4), replace(state), prepared)
+    theta = corner_angles(prepared.start, prepared.observations)[prepared.observations.visible]
+    other = initial_state(LensModel("equidistant", 4), prepared)
     fitted = bent.fits["equisolid+k4"]
     own = other.lens[2] * unit_radius("equidistant", theta)
     k = other.terms
     own = own * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
-    assert np.abs(own - fitted.radius(theta)).max() < 3.0  # of 500 px
+    assert np.abs(own - fitted.state.radius_px(theta)).max() < 3.0  # of 500 px
 
 
-def test_the_json_holds_what_people_rely_on(bent: Calibrated) -> None:
-    told = recommend(bent)
-    data = result_data(bent, bent.fits[told.name], told, ["mind the gap"])
+def test_the_json_holds_what_people_rely_on(bent: ModelComparison) -> None:
+    told = recommend_model(bent)
+    chosen = bent.fits[told.name]
+    field = field_of_view(chosen, None, WINDOW)
+    data = result_data(CalibrationResult(bent, chosen, told, field, Coverage([]), ["mind the gap"]))
+    assert data["cautions"] == ["mind the gap"]
+    assert data["coverage"] == {"share": 0, "next": []}
     assert data["boards_total"] == data["boards_used"] == 14
     assert data["refused"] == []
-    assert data["corners"] == int(bent.prepared.sightings.seen.sum())
+    assert data["corners"] == int(bent.prepared.observations.visible.sum())
     assert data["corners"] >= 14 * 48 - 4  # the bend moves a corner or two out of the picture
     assert sum(data["corners_by_picture"].values()) == data["corners"]
     assert max(data["corners_by_picture"].values()) == data["corners_of_a_board"] == 48
@@ -138,18 +144,18 @@ def test_the_json_holds_what_people_rely_on(bent: Calibrated) -> None:
             fit
         )
         assert fit["rms_px"] == pytest.approx(fit["rms_per_coordinate_px"] * math.sqrt(2))
-        error = bent.fits[name].residuals_px[bent.fits[name].sightings.seen]
+        error = bent.fits[name].residuals_px[bent.fits[name].observations.visible]
         assert fit["rms_px"] == pytest.approx(float(np.sqrt((error**2).sum(1).mean())))
         assert fit["stages"][0]["name"] == "levenberg-marquardt"
         assert all(stage["stopped"] for stage in fit["stages"])
 
 
-def test_the_field_ends_at_the_circle_or_where_the_fit_ends(bent: Calibrated) -> None:
+def test_the_field_ends_at_the_circle_or_where_the_fit_ends(bent: ModelComparison) -> None:
     fit = bent.fits["equisolid+k2+board"]
     assert math.degrees(fit.measured_to_rad) > 90
     at_circle = field_of_view(fit, 480.0, WINDOW)
     assert at_circle.ends_at == "the image circle"
-    assert fit.radius(np.asarray(at_circle.half_rad)) == pytest.approx(480.0, abs=0.05)
+    assert fit.state.radius_px(np.asarray(at_circle.half_rad)) == pytest.approx(480.0, abs=0.05)
     corner = field_of_view(fit, None, (400.0, 400.0, 700.0, 700.0))
     assert corner.ends_at == "the corner of the picture"
     far = math.hypot(max(fit.cx - 400, 700 - fit.cx), max(fit.cy - 400, 700 - fit.cy))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from board_render import RenderStyle, draw_picture
+from synthetic_boards import DrawnCamera, spread_poses, true_corners
 
 from bikeped.geometry import Lens
-from bikeped.lab.calibration.board_render import Look, draw_picture
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.corners.grid_growing import grids
-from bikeped.lab.calibration.synthetic import DrawnCamera, spread_poses, true_corners
+from bikeped.lab.calibration.corners.grid_growing import find_grids
 from bikeped.types import ImageArray
 
 PATTERN = BoardPattern(8, 6, 0.04)
@@ -55,9 +55,9 @@ def noisy(picture: np.ndarray, rng: np.random.Generator) -> ImageArray:
 
 @pytest.mark.parametrize("number", range(3))
 def test_a_grid_goes_round_what_hides_the_board(number: int) -> None:
-    look = Look(occluded=0.2, samples=3)
-    picture = draw_picture(CAMERA, PATTERN, POSES[number], look=look, seed=number)
-    grid = grids(picture)[0]
+    style = RenderStyle(occluded=0.2, samples=3)
+    picture = draw_picture(CAMERA, PATTERN, POSES[number], style=style, seed=number)
+    grid = find_grids(picture)[0]
     truth, _ = true_corners(CAMERA, PATTERN, POSES[number])
     off = np.linalg.norm(grid.uv_px[:, None] - truth, axis=-1)
     nearest = off.argmin(1)
@@ -76,7 +76,7 @@ def test_a_finger_across_the_board_is_stepped_over() -> None:
     squares = np.indices((7, 9)).sum(0) % 2 * 170 + 40.0
     picture = np.pad(np.kron(squares, np.ones((24, 24))), 40, constant_values=210)
     picture[:, 40 + 24 * 3 + 14 : 40 + 24 * 5 - 14] = 120  # all of the fourth column
-    grid = grids(noisy(picture, np.random.default_rng(1)))[0]
+    grid = find_grids(noisy(picture, np.random.default_rng(1)))[0]
     assert len(grid) == 42
     assert sorted(np.ptp(grid.cell, axis=0) + 1) == [6, 8]
 
@@ -87,7 +87,7 @@ def test_two_boards_are_two_grids() -> None:
     both = noisy(
         np.concatenate([one, np.full((200, 40), 120.0), one], axis=1), np.random.default_rng(1)
     )
-    found = grids(both)
+    found = find_grids(both)
     assert [len(grid) for grid in found] == [48, 48]
     assert not set(map(tuple, found[0].uv_px)) & set(map(tuple, found[1].uv_px))
 
@@ -96,5 +96,5 @@ def test_two_boards_are_two_grids() -> None:
 def test_busy_pictures_give_no_grid_of_a_board_s_size(draw: object) -> None:
     assert callable(draw)
     for seed in range(2):
-        for grid in grids(draw(np.random.default_rng(seed))):
+        for grid in find_grids(draw(np.random.default_rng(seed))):
             assert len(grid) < PATTERN.count / 3

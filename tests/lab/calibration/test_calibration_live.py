@@ -11,29 +11,37 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
+from board_render import draw_picture
+from synthetic_boards import BoardPose, DrawnCamera, draw_views, spread_poses
 
 from bikeped.capture import FrameSource
+from bikeped.config import WebConfig
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.geometry import Lens
-from bikeped.lab.calibration.board_render import draw_picture
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
-from bikeped.lab.calibration.capture.coverage import Coverage, Part, cover, empty_parts
-from bikeped.lab.calibration.capture.guide import Answer, Guide
-from bikeped.lab.calibration.capture.live_page import LivePage, live_routes
-from bikeped.lab.calibration.capture.live_session import LiveSession, assumed_lens, capture_boards
-from bikeped.lab.calibration.synthetic import BoardPose, DrawnCamera, draw_views, spread_poses
+from bikeped.lab.calibration.capture.coverage import (
+    CircleSector,
+    Coverage,
+    circle_sectors,
+    measure_coverage,
+)
+from bikeped.lab.calibration.capture.guide import CaptureGuide, FrameStatus
+from bikeped.lab.calibration.capture.live_page import LivePage, add_live_page
+from bikeped.lab.calibration.capture.live_session import LiveSession, capture_boards
+from bikeped.lab.calibration.corners.candidates import assumed_lens
 from bikeped.types import Frame, ImageArray
+from bikeped.web.security import load_access_policy
+from bikeped.web.server import make_application
 
 PATTERN = BoardPattern(7, 6, 0.04)
 SIDE = 480
 CAMERA = DrawnCamera(Lens.from_circle("equidistant", 236, 190), 241.0, 238.0, SIDE, SIDE)
 
 
-def guide() -> Guide:
+def guide() -> CaptureGuide:
     lens, centre = assumed_lens(SIDE, SIDE)
-    return Guide(PATTERN, SIDE, SIDE, lens, centre)
+    return CaptureGuide(PATTERN, SIDE, SIDE, lens, centre)
 
 
 def board(x_m: float = 0.0, y_m: float = 0.0, seed: int = 0) -> ImageArray:
@@ -67,24 +75,24 @@ class Recording(FrameSource):
 def test_a_board_is_kept_once_it_is_still_and_only_once() -> None:
     guided = guide()
     answers = [
-        guided.look(np.full((SIDE, SIDE), 90, np.uint8), 0.0),
-        guided.look(board(seed=1), 0.2),
-        guided.look(board(0.08, seed=2), 0.4),
-        guided.look(board(0.08, seed=3), 0.6),
-        guided.look(board(0.08, seed=4), 0.8),
-        guided.look(board(-0.1, seed=5), 5.0),
-        guided.look(board(-0.1, seed=6), 9.0),  # too long after the last look
-        guided.look(board(-0.1, seed=7), 9.2),
+        guided.check_frame(np.full((SIDE, SIDE), 90, np.uint8), 0.0),
+        guided.check_frame(board(seed=1), 0.2),
+        guided.check_frame(board(0.08, seed=2), 0.4),
+        guided.check_frame(board(0.08, seed=3), 0.6),
+        guided.check_frame(board(0.08, seed=4), 0.8),
+        guided.check_frame(board(-0.1, seed=5), 5.0),
+        guided.check_frame(board(-0.1, seed=6), 9.0),  # too long after the last look
+        guided.check_frame(board(-0.1, seed=7), 9.2),
     ]
-    assert [one.answer for one in answers] == [
-        Answer.NO_BOARD,
-        Answer.MOVING,
-        Answer.MOVING,
-        Answer.KEPT,
-        Answer.SEEN,
-        Answer.MOVING,
-        Answer.MOVING,
-        Answer.KEPT,
+    assert [one.status for one in answers] == [
+        FrameStatus.NO_BOARD,
+        FrameStatus.MOVING,
+        FrameStatus.MOVING,
+        FrameStatus.KEPT,
+        FrameStatus.SEEN,
+        FrameStatus.MOVING,
+        FrameStatus.MOVING,
+        FrameStatus.KEPT,
     ]
     assert len(guided.kept) == 2
     assert answers[3].uv_px.shape == (42, 2)
@@ -94,10 +102,10 @@ def test_a_board_is_kept_once_it_is_still_and_only_once() -> None:
 def test_a_blurred_board_is_not_kept() -> None:
     guided = guide()
     sharp = board(0.08)
-    guided.look(sharp, 0.0)
+    guided.check_frame(sharp, 0.0)
     blurred = np.asarray(cv2.GaussianBlur(board(-0.1), (0, 0), 2.2), np.uint8)
-    assert guided.look(blurred, 0.2).answer is Answer.BLURRED
-    assert guided.look(blurred, 0.4).answer is Answer.BLURRED
+    assert guided.check_frame(blurred, 0.2).status is FrameStatus.BLURRED
+    assert guided.check_frame(blurred, 0.4).status is FrameStatus.BLURRED
     assert not guided.kept
 
 
@@ -105,11 +113,11 @@ def test_it_says_when_there_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     guided = guide()
     views = draw_views(CAMERA, PATTERN, spread_poses(CAMERA, PATTERN, 60, span_deg=(40, 70)))
     guided.kept = views[:5]
-    guided.coverage = guided._cover()
+    guided.coverage = guided._measure()
     assert not guided.enough
     assert "hold the board there" in guided.advice
     guided.kept = views
-    guided.coverage = guided._cover()
+    guided.coverage = guided._measure()
     assert guided.coverage.share > 0.85
     assert guided.enough
     assert guided.advice.startswith("enough: 60 boards")
@@ -118,37 +126,37 @@ def test_it_says_when_there_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_empty_circle_is_all_gaps_and_words_point_the_right_way() -> None:
     lens = Lens.from_circle("equidistant", 500, 190)
     window = (0.0, 0.0, 1001.0, 1001.0)
-    assert cover([], lens, (500, 500), window).share == 0
+    assert measure_coverage([], lens, (500, 500), window).share == 0
     ids = np.arange(16, dtype=np.int64)
     spots = {"upper left": (-1, -1), "right": (1, 0), "bottom": (0, 1)}
     for way, (x, y) in spots.items():
         unit = np.array([x, y]) / math.hypot(x, y)
         uv = 500 + 440 * unit + np.random.default_rng(0).uniform(-20, 20, (16, 2))
         view = BoardView("a", ids, uv, 1001, 1001)
-        covered = cover([view, view], lens, (500, 500), window)
-        hit = [part.where for part in covered.parts if part.covered]
+        covered = measure_coverage([view, view], lens, (500, 500), window)
+        hit = [part.where for part in covered.sectors if part.covered]
         assert hit == [f"{way}, at the rim"]
         assert not any(line.startswith(f"{way}, at the rim") for line in covered.advice(40))
 
 
 def test_parts_tile_the_circle_and_stay_on_the_picture() -> None:
     lens = Lens.from_circle("equisolid", 500, 190)
-    parts = empty_parts(lens, (500, 500), (0, 0, 1001, 1001))
+    parts = circle_sectors(lens, (500, 500), (0, 0, 1001, 1001))
     solid = sum(
         (math.cos(p.from_rad) - math.cos(p.to_rad)) * (p.stop_rad - p.start_rad) for p in parts
     )
     assert solid == pytest.approx(2 * math.pi * (1 - math.cos(math.radians(95))), rel=1e-9)
-    low = empty_parts(lens, (500, 500), (0, 200, 1001, 801))
+    low = circle_sectors(lens, (500, 500), (0, 200, 1001, 801))
     assert len(low) < len(parts)
     assert not any(part.where == "top, at the rim" for part in low)
 
 
 def test_the_emptiest_part_comes_first() -> None:
-    def part(corners: int, to_rad: float, where: str) -> Part:
-        return Part(0.0, to_rad, 0.0, 1.0, where, corners, 2)
+    def sector(corners: int, to_rad: float, where: str) -> CircleSector:
+        return CircleSector(0.0, to_rad, 0.0, 1.0, where, corners, 2)
 
     coverage = Coverage(
-        [part(11, 1.0, "a"), part(0, 1.0, "b"), part(0, 1.5, "c"), part(20, 1, "d")]
+        [sector(11, 1.0, "a"), sector(0, 1.0, "b"), sector(0, 1.5, "c"), sector(20, 1, "d")]
     )
     assert [one.where for one in coverage.gaps] == ["c", "b", "a"]
     assert coverage.share == 0.25
@@ -188,9 +196,9 @@ async def test_the_page_tells_and_streams() -> None:
     guided = guide()
     session = LiveSession(guided)
     picture = board()
-    session.show(picture, guided.look(picture, 0.0))
-    app = web.Application()
-    app.add_routes(live_routes(session))
+    session.publish(picture, guided.check_frame(picture, 0.0))
+    policy = load_access_policy(WebConfig())
+    app = make_application(policy, lambda app: add_live_page(app, session))
     async with TestClient(TestServer(app)) as client:
         page = await (await client.get("/calibrate")).text()
         assert 'src="calibrate/stream"' in page
@@ -198,7 +206,7 @@ async def test_the_page_tells_and_streams() -> None:
         assert status["says"] == "a board: hold it still"
         assert status["kept"] == 0
         assert status["next"] == guided.advice
-        assert len(status["parts"]) == len(guided.coverage.parts)
+        assert len(status["parts"]) == len(guided.coverage.sectors)
         stream = await client.get("/calibrate/stream")
         start = await stream.content.readuntil(b"\r\n\r\n")
         assert b"image/jpeg" in start
@@ -226,5 +234,5 @@ async def test_the_page_of_its_own_serves_this_machine_only() -> None:
                 )
         with LivePage(LiveSession(guide()), port=port) as second:
             assert second.url is None
-            assert "set web.port" in str(second.error)
+            assert "web.port to a free one" in str(second.error)
     assert session.stopped

@@ -8,18 +8,21 @@ import re
 import cv2
 import numpy as np
 import pytest
+from board_render import RenderStyle, draw_picture
+from calibration_scenes import refusal_of
+from synthetic_boards import BoardPose, DrawnCamera, spread_poses, true_corners
 
 from bikeped.geometry import Lens
-from bikeped.lab.calibration.board_render import Look, draw_picture
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.capture.pictures import Picture
-from bikeped.lab.calibration.corners.board_check import Checked
-from bikeped.lab.calibration.corners.find_boards import find_board, find_boards
+from bikeped.lab.calibration.capture.images import CalibrationImage
+from bikeped.lab.calibration.corners.board_check import DetectedBoard
+from bikeped.lab.calibration.corners.board_detector import detect_board
 from bikeped.lab.calibration.corners.partial_board import LEAST_SHARE, partial_board
+from bikeped.lab.calibration.image_pipeline import detect_boards
+from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.lab.calibration.solver.bundle_adjustment import adjust
-from bikeped.lab.calibration.solver.lens_model import Model
-from bikeped.lab.calibration.solver.observations import prepare
-from bikeped.lab.calibration.synthetic import BoardPose, DrawnCamera, spread_poses, true_corners
+from bikeped.lab.calibration.solver.lens_model import LensModel
+from bikeped.lab.calibration.solver.observations import prepare_observations
 from bikeped.types import FloatArray, ImageArray
 
 PATTERN = BoardPattern(8, 6, 0.04)
@@ -29,15 +32,15 @@ POSES = spread_poses(CAMERA, PATTERN, 8, seed=3, span_deg=(45, 65), margin_px=20
 
 
 def draw(number: int, hidden: float, pattern: BoardPattern = PATTERN) -> ImageArray:
-    look = Look(occluded=hidden, samples=3)
-    return draw_picture(CAMERA, pattern, POSES[number], look=look, seed=number)
+    style = RenderStyle(occluded=hidden, samples=3)
+    return draw_picture(CAMERA, pattern, POSES[number], style=style, seed=number)
 
 
 def truth(number: int, pattern: BoardPattern = PATTERN) -> FloatArray:
     return true_corners(CAMERA, pattern, POSES[number])[0]
 
 
-def off_px(board: Checked, uv: FloatArray) -> FloatArray:
+def off_px(board: DetectedBoard, uv: FloatArray) -> FloatArray:
     """[n] by its ids; a board that looks the same turned by half may carry them either way."""
     ways = [np.linalg.norm(board.uv_px - way[board.ids], axis=1) for way in (uv, uv[::-1])]
     return min(ways, key=lambda way: float(way.mean()))
@@ -47,7 +50,6 @@ def off_px(board: Checked, uv: FloatArray) -> FloatArray:
 def test_every_id_is_right_and_corners_beside_what_hides_them_too(hidden: float) -> None:
     for number in range(5):
         board = partial_board(draw(number, hidden), PATTERN)
-        assert isinstance(board, Checked), board
         assert LEAST_SHARE * 48 <= len(board.ids) < 48
         assert (np.diff(board.ids) > 0).all()
         off = off_px(board, truth(number))
@@ -59,26 +61,23 @@ def test_colours_tell_which_way_round_as_for_whole_boards() -> None:
     """7 + 6 is odd: corner 0 is the same one in every picture, however the board is turned."""
     for number in range(4):
         board = partial_board(draw(number, 0.15, ODD), ODD)
-        assert isinstance(board, Checked), board
         np.testing.assert_allclose(board.uv_px, truth(number, ODD)[board.ids], atol=0.3)
 
 
 def test_whole_and_partial_boards_are_counted_alike() -> None:
     for number in range(4):
         whole, part = (
-            find_board(draw(number, 0.0), PATTERN),
+            detect_board(draw(number, 0.0), PATTERN),
             partial_board(draw(number, 0.2), PATTERN),
         )
-        assert whole.board is not None
-        assert isinstance(part, Checked)
-        _, mine, theirs = np.intersect1d(whole.board.ids, part.ids, return_indices=True)
-        np.testing.assert_allclose(whole.board.uv_px[mine], part.uv_px[theirs], atol=0.3)
+        _, mine, theirs = np.intersect1d(whole.ids, part.ids, return_indices=True)
+        np.testing.assert_allclose(whole.uv_px[mine], part.uv_px[theirs], atol=0.3)
 
 
 def test_a_board_cut_by_the_picture_s_edge() -> None:
     """Through the last column at a slant: pinned. Before it: told by the margin. Two: unknown."""
     pose = BoardPose(np.eye(3), np.array([0.0, 0.0, 0.3]))
-    picture = draw_picture(CAMERA, PATTERN, pose, look=Look(samples=3))
+    picture = draw_picture(CAMERA, PATTERN, pose, style=RenderStyle(samples=3))
     uv = true_corners(CAMERA, PATTERN, pose)[0].reshape(6, 8, 2)
     slant = picture.copy()
     start, end = uv[1, 7] + [14.0, -30.0], uv[5, 6] + [14.0, 0.0]
@@ -86,16 +85,13 @@ def test_a_board_cut_by_the_picture_s_edge() -> None:
     cut = np.array([start - way, end + way, end + way + [400, 0], start - way + [400, 0]])
     cv2.fillPoly(slant, [np.rint(cut).astype(np.int32)], 0)
     seen = partial_board(slant, PATTERN)
-    assert isinstance(seen, Checked), seen
     assert 40 <= len(seen.ids) < 48
     assert off_px(seen, uv.reshape(-1, 2)).max() < 0.3
     between = [round(float((uv[2, k, 0] + uv[2, k + 1, 0]) / 2)) for k in (6, 5)]
     one = partial_board(np.ascontiguousarray(picture[:, : between[0]]), PATTERN)
-    assert isinstance(one, Checked), one
     assert len(one.ids) >= 38
     assert off_px(one, uv.reshape(-1, 2)).max() < 0.3
-    two = partial_board(np.ascontiguousarray(picture[:, : between[1]]), PATTERN)
-    assert isinstance(two, str)
+    two = refusal_of(partial_board, np.ascontiguousarray(picture[:, : between[1]]), PATTERN)
     assert two.startswith("6 of 8 columns of the 8x6 board are in sight")
 
 
@@ -104,20 +100,18 @@ def no_whole_board(monkeypatch: pytest.MonkeyPatch) -> None:
     """The detectors of whole boards find nothing, at once instead of after seconds."""
     for name in ("raw_candidates", "remapped_candidates"):
         monkeypatch.setattr(
-            f"bikeped.lab.calibration.corners.find_boards.{name}", lambda grey, pattern: iter(())
+            f"bikeped.lab.calibration.corners.board_detector.{name}", lambda grey, pattern: iter(())
         )
 
 
 @pytest.mark.usefixtures("no_whole_board")
 def test_the_picture_is_used_and_the_reason_is_passed_on() -> None:
-    seen = find_board(draw(0, 0.35), PATTERN)
-    assert seen.board is not None, seen.why
-    assert len(seen.board.ids) < 48
-    refused = find_board(draw(0, 0.2), BoardPattern(7, 5))
-    assert refused.board is None
-    assert refused.why.startswith("no whole 7x5 board found: the board has more inner corners than")
-    empty = find_board(np.full((480, 640), 90, np.uint8), PATTERN)
-    assert empty.why == "no whole 8x6 board found"
+    seen = detect_board(draw(0, 0.35), PATTERN)
+    assert len(seen.ids) < 48
+    reason = refusal_of(detect_board, draw(0, 0.2), BoardPattern(7, 5))
+    assert reason.startswith("no whole 7x5 board found: the board has more inner corners than")
+    empty = refusal_of(detect_board, np.full((480, 640), 90, np.uint8), PATTERN)
+    assert empty == "no whole 8x6 board found"
 
 
 def test_a_live_frame_has_no_time_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,8 +121,9 @@ def test_a_live_frame_has_no_time_for_it(monkeypatch: pytest.MonkeyPatch) -> Non
         called.append(pattern)
         return "asked"
 
-    monkeypatch.setattr("bikeped.lab.calibration.corners.find_boards.partial_board", asked)
-    assert find_board(draw(0, 0.35), PATTERN, thorough=False).board is None
+    monkeypatch.setattr("bikeped.lab.calibration.corners.board_detector.partial_board", asked)
+    with pytest.raises(BoardRefusedError):
+        detect_board(draw(0, 0.35), PATTERN, thorough=False)
     assert not called
 
 
@@ -136,8 +131,7 @@ def test_a_live_frame_has_no_time_for_it(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_another_board_than_the_one_that_was_asked_for_is_refused(asked: BoardPattern) -> None:
     drawn = BoardPattern(9, 7, 0.035)
     for number in range(3):
-        answer = partial_board(draw(number, 0.1 * number, drawn), asked)
-        assert isinstance(answer, str)
+        answer = refusal_of(partial_board, draw(number, 0.1 * number, drawn), asked)
         assert "more inner corners than" in answer or "9 of 10 columns" in answer
 
 
@@ -149,8 +143,7 @@ def test_a_few_corners_are_too_few() -> None:
     for row, column in [*spots, (0, 3), (0, 4), (5, 4)]:
         u, v = np.rint(uv[row, column]).astype(int)
         cv2.circle(picture, (int(u), int(v)), 6, 110, -1)
-    answer = partial_board(picture, PATTERN)
-    assert isinstance(answer, str)
+    answer = refusal_of(partial_board, picture, PATTERN)
     assert re.fullmatch(r"only (1\d|2[01]) of 48 corners can be seen clearly, not 24", answer)
 
 
@@ -159,24 +152,24 @@ def test_a_board_that_lacks_a_line_needs_another_picture_that_shows_them_all() -
     """It may be a smaller board, cut: 7x6 when 8x6 was asked for."""
     pose = BoardPose(np.eye(3), np.array([0.0, 0.0, 0.3]))
     uv = true_corners(CAMERA, PATTERN, pose)[0].reshape(6, 8, 2)
-    cut = draw_picture(CAMERA, PATTERN, pose, look=Look(samples=3))
+    cut = draw_picture(CAMERA, PATTERN, pose, style=RenderStyle(samples=3))
     cut[:, round(float((uv[2, 6, 0] + uv[2, 7, 0]) / 2)) :] = 0
     pictures = [
-        Picture(f"{number}.png", 640, 480, f"{number:064x}", grey)
+        CalibrationImage(f"{number}.png", 640, 480, f"{number:064x}", grey)
         for number, grey in enumerate([cut, draw(0, 0.2)])
     ]
-    alone = find_boards(pictures[:1], PATTERN, workers=1)
+    alone = detect_boards(pictures[:1], PATTERN, workers=1)
     assert not alone.views
-    assert "no other picture shows all of them" in alone.refused[0].why
-    both = find_boards(pictures, PATTERN, workers=1)
+    assert "no other picture shows all of them" in alone.refused[0].reason
+    both = detect_boards(pictures, PATTERN, workers=1)
     assert [view.name for view in both.views] == ["0.png", "1.png"]
 
 
 @pytest.mark.usefixtures("no_whole_board")
 def test_the_lens_comes_out_as_from_whole_boards() -> None:
-    found = find_boards(
+    found = detect_boards(
         [
-            Picture(f"{number}.png", 640, 480, f"{number:064x}", draw(number, 0.1))
+            CalibrationImage(f"{number}.png", 640, 480, f"{number:064x}", draw(number, 0.1))
             for number in range(4)
         ],
         PATTERN,
@@ -184,9 +177,9 @@ def test_the_lens_comes_out_as_from_whole_boards() -> None:
     )
     assert len(found.views) == 4
     assert sum(len(view) for view in found.views) < 4 * 48
-    prepared = prepare(found)
-    assert not prepared.left_out
-    fitted = adjust(prepared.sightings, Model("equidistant"), prepared.start)
+    prepared = prepare_observations(found)
+    assert not prepared.outliers
+    fitted = adjust(prepared.observations, LensModel("equidistant"), prepared.start)
     assert fitted.sigma_px < 0.05
     assert fitted.state.lens[2] == pytest.approx(CAMERA.lens.focal_px, rel=1e-3)
     np.testing.assert_allclose(fitted.state.lens[:2], [CAMERA.cx, CAMERA.cy], atol=0.15)

@@ -17,21 +17,25 @@ from calibration_scenes import boards, camera, found
 from bikeped.config import ground_camera, load_config
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens
-from bikeped.lab.calibration.board_view import Refused
+from bikeped.lab.calibration.board_view import RefusedImage
+from bikeped.lab.calibration.capture.coverage import CircleSector, Coverage
 from bikeped.lab.calibration.report.board_images import Thumbnail
-from bikeped.lab.calibration.report.calibration_file import (
-    Field,
-    calibration_data,
+from bikeped.lab.calibration.report.calibration_file import calibration_data, write_calibration
+from bikeped.lab.calibration.report.field_of_view import (
+    FieldOfView,
+    brightest_pixels,
+    circle_radius_px,
     field_of_view,
-    write_calibration,
 )
-from bikeped.lab.calibration.report.html_report import Told, report_page
-from bikeped.lab.calibration.report.results import cautions_of
-from bikeped.lab.calibration.solver.compare import Calibrated, calibrate, recommend
-from bikeped.lab.calibration.solver.image_circle import brightest, circle_radius_px
-from bikeped.lab.calibration.solver.lens_model import Model
-from bikeped.lab.calibration.solver.observations import prepare
-from bikeped.lab.calibration.solver.outliers import LeftOut
+from bikeped.lab.calibration.report.html_report import report_page
+from bikeped.lab.calibration.report.results import CalibrationResult, calibration_cautions
+from bikeped.lab.calibration.solver.lens_model import LensModel
+from bikeped.lab.calibration.solver.model_comparison import (
+    ModelComparison,
+    fit_models,
+    recommend_model,
+)
+from bikeped.lab.calibration.solver.observations import OutlierCorner, prepare_observations
 from bikeped.lab.simulation.suite import Suite
 from bikeped.pipeline.ground_mapper import GroundMapper
 
@@ -41,29 +45,37 @@ NOW = datetime.datetime(2031, 5, 6, 7, 8, 9, tzinfo=datetime.timezone.utc)
 
 
 @pytest.fixture(scope="module")
-def done() -> Calibrated:
+def done() -> ModelComparison:
     """A 200 degree lens with four radial terms in the 3500 px crop."""
     drawn = camera("equidistant", 100.0, K)
     views = boards(drawn, 12, noise_px=0.3)
-    prepared = prepare(found(views, [Refused("<b>x.jpg", "same picture as a & b")]))
-    models = [Model("equidistant"), Model("equidistant", 4), Model("equidistant", 2, True)]
-    return calibrate(prepared, models, 3)
+    prepared = prepare_observations(
+        found(views, [RefusedImage("<b>x.jpg", "same picture as a & b")])
+    )
+    models = [
+        LensModel("equidistant"),
+        LensModel("equidistant", 4),
+        LensModel("equidistant", 2, True),
+    ]
+    return fit_models(prepared, models, 3)
 
 
-def the_field(done: Calibrated, name: str = "equidistant+k4") -> Field:
+def the_field(done: ModelComparison, name: str = "equidistant+k4") -> FieldOfView:
     return field_of_view(done.fits[name], 1750.0, FRAMING.window_px)
 
 
-def write_pair(done: Calibrated, folder: Path, name: str = "equidistant+k4") -> Path:
+def write_pair(done: ModelComparison, folder: Path, name: str = "equidistant+k4") -> Path:
     """The calibration file and a configuration that uses it."""
-    data = calibration_data(done, done.fits[name], the_field(done, name), FRAMING, NOW)
+    data = calibration_data(done.prepared, done.fits[name], the_field(done, name), FRAMING, NOW)
     write_calibration(folder / "measured.json", data)
     config = folder / "config.yaml"
     config.write_text("camera: {calibration: measured.json, height_m: 3.6576}\n")
     return config
 
 
-def test_the_ground_camera_has_exactly_the_fitted_lens(done: Calibrated, tmp_path: Path) -> None:
+def test_the_ground_camera_has_exactly_the_fitted_lens(
+    done: ModelComparison, tmp_path: Path
+) -> None:
     loaded = load_config(write_pair(done, tmp_path))
     own = ground_camera(loaded)
     fit = done.fits["equidistant+k4"]
@@ -72,7 +84,7 @@ def test_the_ground_camera_has_exactly_the_fitted_lens(done: Calibrated, tmp_pat
     assert (own.cx, own.cy) == (fit.cx, fit.cy)
     assert math.degrees(2 * own.lens.max_theta_rad) == pytest.approx(200, abs=1.5)
     theta = np.linspace(0, own.lens.max_theta_rad, 50)
-    np.testing.assert_allclose(own.lens.radius(theta), fit.radius(theta), rtol=1e-12)
+    np.testing.assert_allclose(own.lens.radius(theta), fit.state.radius_px(theta), rtol=1e-12)
     # The installer's way, by radius and field of view, gives the same lens.
     data = json.loads((tmp_path / "measured.json").read_text())
     again = Lens.from_circle(data["model"], data["radius_px"], data["fov_deg"], own.lens.k)
@@ -84,7 +96,9 @@ def test_the_ground_camera_has_exactly_the_fitted_lens(done: Calibrated, tmp_pat
     assert ground_camera(both).lens.focal_px == pytest.approx(fit.focal_px, rel=1e-14)
 
 
-def test_run_replay_and_conformance_read_all_four_terms(done: Calibrated, tmp_path: Path) -> None:
+def test_run_replay_and_conformance_read_all_four_terms(
+    done: ModelComparison, tmp_path: Path
+) -> None:
     config = write_pair(done, tmp_path)
     loaded = load_config(config)
     cut = load_config(config, ["camera.k3=0", "camera.k4=0"])
@@ -98,7 +112,7 @@ def test_run_replay_and_conformance_read_all_four_terms(done: Calibrated, tmp_pa
         assert np.abs(here - there).max() > 0.05  # metres: the higher terms count
 
 
-def test_the_file_has_its_keys(done: Calibrated, tmp_path: Path) -> None:
+def test_the_file_has_its_keys(done: ModelComparison, tmp_path: Path) -> None:
     write_pair(done, tmp_path)
     data = json.loads((tmp_path / "measured.json").read_text())
     fit = done.fits["equidistant+k4"]
@@ -117,7 +131,7 @@ def test_the_file_has_its_keys(done: Calibrated, tmp_path: Path) -> None:
     assert data["software_version"]
 
 
-def test_the_former_file_is_kept(done: Calibrated, tmp_path: Path) -> None:
+def test_the_former_file_is_kept(done: ModelComparison, tmp_path: Path) -> None:
     path = tmp_path / "measured.json"
     assert write_calibration(path, {"n": 1}) is None
     assert write_calibration(path, {"n": 2}) == tmp_path / "measured.json.bak"
@@ -126,18 +140,18 @@ def test_the_former_file_is_kept(done: Calibrated, tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["measured.json", "measured.json.bak"]
 
 
-def test_a_fit_that_is_no_lens_is_not_written(done: Calibrated) -> None:
+def test_a_fit_that_is_no_lens_is_not_written(done: ModelComparison) -> None:
     fit = done.fits["equidistant+k4"]
-    too_far = Field(math.radians(179), 4000.0, "the image circle")
+    too_far = FieldOfView(math.radians(179), 4000.0, "the image circle")
     with pytest.raises(CalibrationError, match="no lens over 358"):
-        calibration_data(done, fit, too_far, FRAMING)
+        calibration_data(done.prepared, fit, too_far, FRAMING)
 
 
-def test_words_of_caution(done: Calibrated) -> None:
+def test_words_of_caution(done: ModelComparison) -> None:
     fit = done.fits["equidistant+k4"]
-    assert cautions_of(done, fit, the_field(done)) == []
-    wide = Field(math.radians(150), 2000.0, "the image circle")
-    assert any("extrapolated" in text for text in cautions_of(done, fit, wide))
+    assert calibration_cautions(done.prepared, fit, the_field(done)) == []
+    wide = FieldOfView(math.radians(150), 2000.0, "the image circle")
+    assert any("extrapolated" in text for text in calibration_cautions(done.prepared, fit, wide))
 
 
 def test_the_image_circle_is_measured_on_the_pictures() -> None:
@@ -148,9 +162,11 @@ def test_the_image_circle_is_measured_on_the_pictures() -> None:
         np.where(radius < 500, rng.integers(20, 255, radius.shape), 12).astype(np.uint8)
         for _ in range(8)
     ]
-    assert circle_radius_px(brightest(grays), np.array([520.0, 380.0])) == pytest.approx(500, abs=2)
+    assert circle_radius_px(brightest_pixels(grays), np.array([520.0, 380.0])) == pytest.approx(
+        500, abs=2
+    )
     full = [np.full((780, 1030), 128, np.uint8)]
-    assert circle_radius_px(brightest(full), np.array([520.0, 380.0])) is None
+    assert circle_radius_px(brightest_pixels(full), np.array([520.0, 380.0])) is None
 
 
 class _Links(HTMLParser):
@@ -168,21 +184,20 @@ class _Links(HTMLParser):
                 self.elsewhere.append(value)
 
 
-def test_the_page_is_whole_by_itself(done: Calibrated) -> None:
-    told = recommend(done)
+def test_the_page_is_whole_by_itself(done: ModelComparison) -> None:
+    told = recommend_model(done)
     chosen = done.fits["equidistant+k2+board"]
-    views = done.prepared.sightings.names
+    views = done.prepared.observations.names
     gray = np.random.default_rng(1).integers(0, 255, (2160, 3840), dtype=np.uint8)
-    prepared = replace(done.prepared, left_out=(LeftOut("c.jpg", 7, 31.4),))
+    prepared = replace(done.prepared, outliers=(OutlierCorner("c.jpg", 7, 31.4),))
     page = report_page(
-        Told(
+        CalibrationResult(
             replace(done, prepared=prepared),
             chosen,
             told,
             the_field(done),
+            Coverage([CircleSector(1, 1.5, 0, 1, "upper <left>")]),
             ["mind <this>"],
-            ["upper left"],
-            [(1, 1.5, 0, 1)],
         ),
         [Thumbnail(name, gray, FRAMING.offset_px) for name in views],
     )
@@ -194,6 +209,7 @@ def test_the_page_is_whole_by_itself(done: Calibrated) -> None:
     assert parser.tags.count("image") == 12
     assert page.count("data:image/png;base64,") >= 4
     assert "mind &lt;this&gt;" in page
+    assert "upper &lt;left&gt;" in page
     assert "&lt;b&gt;x.jpg" in page
     assert "corner 7: 31.4 px off" in page
     assert "same picture as a &amp; b" in page

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.lab.calibration.corners.saddle_points import links, saddles
+from bikeped.lab.calibration.corners.saddle_points import find_saddle_points, link_neighbours
 from bikeped.types import FloatArray, ImageArray
 
 
-def crossing(angle_deg: float, between_deg: float, at: tuple[float, float]) -> ImageArray:
+def crossing_score(angle_deg: float, between_deg: float, at: tuple[float, float]) -> ImageArray:
     """One crossing in the middle of nothing: dark, light, dark, light round it."""
     v, u = np.mgrid[:80, :80].astype(np.float64)
     sides = [
@@ -37,7 +37,7 @@ def angle_to(edge: FloatArray, angle_deg: float) -> float:
 
 @pytest.mark.parametrize(("angle_deg", "between_deg"), [(0, 90), (31, 90), (-50, 60), (110, 130)])
 def test_a_crossing_is_found_with_its_edges(angle_deg: float, between_deg: float) -> None:
-    found = saddles(crossing(angle_deg, between_deg, (40.3, 38.6)))
+    found = find_saddle_points(crossing_score(angle_deg, between_deg, (40.3, 38.6)))
     first = int(found.contrast.argmax())
     np.testing.assert_allclose(found.uv_px[first], [40.3, 38.6], atol=0.12)
     edges = (angle_deg, angle_deg + between_deg)
@@ -47,8 +47,8 @@ def test_a_crossing_is_found_with_its_edges(angle_deg: float, between_deg: float
 
 
 def test_light_lies_to_the_left_of_edges_of_the_first_type_whichever_way_one_looks() -> None:
-    picture = crossing(20, 80, (40, 40)).astype(np.float64)
-    found = saddles(picture.astype(np.uint8))
+    picture = crossing_score(20, 80, (40, 40)).astype(np.float64)
+    found = find_saddle_points(picture.astype(np.uint8))
     first = int(found.contrast.argmax())
     for kind in (0, 1):
         for way in (found.edge[first, kind], -found.edge[first, kind]):
@@ -60,11 +60,11 @@ def test_light_lies_to_the_left_of_edges_of_the_first_type_whichever_way_one_loo
 
 def test_neighbours_on_a_board_find_each_other_and_nobody_else() -> None:
     picture = cv2.GaussianBlur(board(5, 4, 14), (0, 0), 0.7)
-    found = saddles(np.asarray(picture, np.uint8))
+    found = find_saddle_points(np.asarray(picture, np.uint8))
     place = np.rint((found.uv_px + 0.5) / 14 - 2).astype(int)
     inner = (place >= 0).all(1) & (place < [5, 4]).all(1) & (found.contrast > 90)
     assert int(inner.sum()) == 20
-    link = links(np.asarray(picture, np.uint8), found)
+    link = link_neighbours(np.asarray(picture, np.uint8), found)
     for one in np.flatnonzero(inner):
         near = {tuple(place[other]) for other in link[one].ravel() if other >= 0 and inner[other]}
         c, r = place[one]
@@ -75,6 +75,6 @@ def test_neighbours_on_a_board_find_each_other_and_nobody_else() -> None:
 def test_a_plain_picture_has_no_crossing() -> None:
     for picture in (np.full((60, 80), 90), np.tile(np.arange(80), (60, 1))):
         grey = picture.astype(np.uint8)
-        found = saddles(grey)
+        found = find_saddle_points(grey)
         assert len(found) == 0
-        assert links(grey, found).shape == (0, 2, 2)
+        assert link_neighbours(grey, found).shape == (0, 2, 2)

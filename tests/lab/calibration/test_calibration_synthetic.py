@@ -6,15 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from board_render import RenderStyle, draw_picture
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from bikeped.errors import GeometryError
-from bikeped.geometry import Lens
-from bikeped.lab.calibration.board_render import Look, draw_picture
-from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.corners.refine import refine
-from bikeped.lab.calibration.synthetic import (
+from synthetic_boards import (
     BoardBend,
     BoardPose,
     DrawnCamera,
@@ -23,6 +18,11 @@ from bikeped.lab.calibration.synthetic import (
     true_corners,
     turn,
 )
+
+from bikeped.errors import GeometryError
+from bikeped.geometry import Lens
+from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.corners.corner_refinement import refine_corners
 
 PATTERN = BoardPattern(8, 6, 0.04)
 
@@ -108,7 +108,9 @@ def test_a_drawn_picture_shows_what_the_corners_say() -> None:
     """Between the corners lie the squares, dark and light in turn; beyond the circle, nothing."""
     camera = DrawnCamera(Lens.from_circle("equidistant", 300, 200), 303.0, 297.0, 600, 600)
     for number, pose in enumerate(spread_poses(camera, PATTERN, 4, margin_px=8)):
-        picture = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0, blur_px=0.4))
+        picture = draw_picture(
+            camera, PATTERN, pose, style=RenderStyle(noise=0, shade=0, blur_px=0.4)
+        )
         corners = true_corners(camera, PATTERN, pose)[0].reshape(6, 8, 2)
         middle = (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]) / 4
         at = np.rint(middle).astype(int)
@@ -121,13 +123,13 @@ def test_a_drawn_picture_shows_what_the_corners_say() -> None:
 def test_a_drawn_pixel_on_an_edge_is_the_share_of_either_side() -> None:
     """Face on in an almost straight lens, an edge that cuts pixels at 0.3: 0.3 dark, 0.7 light."""
     camera = DrawnCamera(Lens.from_circle("equidistant", 4000, 20), 100.0, 100.0, 201, 201)
-    plain = Look(black=0, white=200, noise=0, blur_px=0, shade=0, samples=20)
+    plain = RenderStyle(black=0, white=200, noise=0, blur_px=0, shade=0, samples=20)
     # 100 px a square: the corner's edge u = 100 + 0.8 cuts pixel 101 (100.5 to 101.5) at 0.3.
     focal = camera.lens.focal_px
     square = 100 / focal
     pattern = BoardPattern(3, 3, square)
     pose = BoardPose(np.eye(3), np.array([0.8 / focal, 0.0, 1.0]))
-    picture = draw_picture(camera, pattern, pose, look=plain)
+    picture = draw_picture(camera, pattern, pose, style=plain)
     assert picture[150, 95] == picture[150, 100]
     sides = float(picture[150, 95]), float(picture[150, 106])
     assert sorted(sides) == [0, 200]
@@ -137,16 +139,18 @@ def test_a_drawn_pixel_on_an_edge_is_the_share_of_either_side() -> None:
 def test_noise_blur_occlusion_and_shade_do_what_they_say() -> None:
     camera = DrawnCamera(Lens.from_circle("equidistant", 300, 200), 299.5, 299.5, 600, 600)
     pose = BoardPose(np.eye(3), np.array([0.0, 0.0, 0.3]))
-    clean = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0)).astype(float)
-    noisy = draw_picture(camera, PATTERN, pose, look=Look(noise=4, shade=0)).astype(float)
+    clean = draw_picture(camera, PATTERN, pose, style=RenderStyle(noise=0, shade=0)).astype(float)
+    noisy = draw_picture(camera, PATTERN, pose, style=RenderStyle(noise=4, shade=0)).astype(float)
     middle = (slice(250, 350), slice(250, 350))
     assert np.std((noisy - clean)[middle]) == pytest.approx(4, rel=0.05)
-    soft = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0, blur_px=3)).astype(float)
+    soft = draw_picture(
+        camera, PATTERN, pose, style=RenderStyle(noise=0, shade=0, blur_px=3)
+    ).astype(float)
     assert np.abs(np.diff(soft[middle])).max() < 0.4 * np.abs(np.diff(clean[middle])).max()
-    hidden = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0, occluded=0.4))
+    hidden = draw_picture(camera, PATTERN, pose, style=RenderStyle(noise=0, shade=0, occluded=0.4))
     share = np.mean(np.abs(hidden.astype(float) - clean) > 50)
     assert 0.005 < share < 0.2
-    shaded = draw_picture(camera, PATTERN, pose, look=Look(noise=0, shade=0.5))
+    shaded = draw_picture(camera, PATTERN, pose, style=RenderStyle(noise=0, shade=0.5))
     rim = int(299.5 + 0.95 * camera.lens.max_radius_px)
     assert shaded[300, rim] < 0.65 * clean[300, rim]
 
@@ -155,10 +159,10 @@ def test_a_bend_is_drawn_where_the_corners_say() -> None:
     camera = DrawnCamera(Lens.from_circle("equidistant", 300, 200), 299.5, 299.5, 600, 600)
     bend = BoardBend(along_columns=0.5, along_rows=-0.3, twist=0.2)
     pose = BoardPose(turn([0.3, -0.5, 0.2]), np.array([0.05, 0.0, 0.25]))
-    picture = draw_picture(camera, PATTERN, pose, look=Look(noise=0, samples=6), bend=bend)
+    picture = draw_picture(camera, PATTERN, pose, style=RenderStyle(noise=0, samples=6), bend=bend)
     truth, _ = true_corners(camera, PATTERN, pose, bend)
     flat, _ = true_corners(camera, PATTERN, pose)
     seen = np.stack([np.arange(48) % 8, np.arange(48) // 8], axis=1).astype(np.float64)
-    refined = refine(picture, seen, truth).uv_px
+    refined = refine_corners(picture, seen, truth).uv_px
     assert np.linalg.norm(refined - truth, axis=1).max() < 0.12
     assert np.linalg.norm(refined - flat, axis=1).max() > 2

@@ -6,6 +6,9 @@ import hashlib
 import json
 import math
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,29 +16,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from board_render import RenderStyle, draw_picture
 from shared_inputs import SHARED, missing
+from synthetic_boards import BoardPose, DrawnCamera, spread_poses, turn
 
 from bikeped.cli.main import main
 from bikeped.config import ground_camera, load_config
 from bikeped.geometry import Lens
-from bikeped.lab.calibration.board_render import Look, draw_picture
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
-from bikeped.lab.calibration.solver.lens_model import Sightings
-from bikeped.lab.calibration.synthetic import BoardPose, DrawnCamera, spread_poses, turn
-from bikeped.lab.cli.calibrate_tables import in_part
+from bikeped.lab.calibration.solver.lens_model import CornerObservations
+from bikeped.lab.cli.calibrate_tables import partial_board_lines
 
 PATTERN = BoardPattern(8, 6, 0.1)
 REAL = SHARED / "media" / "fisheye-checkerboard"
 LENS = Lens("equidistant", 150.0, math.radians(92))
 CAMERA = DrawnCamera(LENS, 243.0, 246.0, 480, 480)
-LOOK = Look(samples=2)
+STYLE = RenderStyle(samples=2)
 
 
 def draw(folder: Path, camera: DrawnCamera, poses: list[BoardPose], start: int = 0) -> list[Path]:
     """Pictures of one board each."""
     paths = []
     for number, pose in enumerate(poses):
-        picture = draw_picture(camera, PATTERN, pose, look=LOOK, seed=start + number)
+        picture = draw_picture(camera, PATTERN, pose, style=STYLE, seed=start + number)
         paths.append(folder / f"board{start + number:02d}.png")
         cv2.imwrite(str(paths[-1]), picture)
     return paths
@@ -253,12 +256,12 @@ def test_boards_in_part_are_named_with_their_corners() -> None:
         BoardView(name, np.arange(count), np.zeros((count, 2)), 640, 480)
         for name, count in (("a/whole.png", 12), ("a/[b].png", 11), ("c.png", 7))
     ]
-    assert in_part(Sightings.of(pattern, views)) == [
+    assert partial_board_lines(CornerObservations.of(pattern, views)) == [
         "  in part: c.png, 7 of 12 corners",
         "  in part: \\[b].png, 11 of 12 corners",
     ]
-    many = Sightings.of(pattern, [views[1]] * 11)
-    assert in_part(many)[8:] == ["  and 3 more boards in part (--json, --report)"]
+    many = CornerObservations.of(pattern, [views[1]] * 11)
+    assert partial_board_lines(many)[8:] == ["  and 3 more boards in part (--json, --report)"]
 
 
 def test_a_board_to_print(calibrate: Run) -> None:
@@ -288,6 +291,37 @@ def test_live_guides_keeps_and_calibrates(calibrate: Run, tmp_path: Path) -> Non
     assert len(list(Path("taken").glob("board-*.png"))) == 5
     assert "kept as board 1" in out
     assert json.loads(Path("lens.json").read_text())["focal_length"] == pytest.approx(150, rel=0.01)
+
+
+def test_ctrl_c_again_and_again_ends_it_in_one_line(tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).integers(0, 255, (1200, 1600)).astype(np.uint8)
+    for number in range(12):  # without a board the search takes seconds each
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.roll(noise, number))
+    (tmp_path / "config.yaml").write_text("camera: {width: 1600, height: 1200}\n")
+    run = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "bikeped.cli.main", "calibrate", str(tmp_path)),
+            *("--live", "--pattern", "8x6", "-c", str(tmp_path / "config.yaml")),
+            *("--set", f"camera.source={tmp_path}", "--set", "web.port=0"),
+        ],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert run.stdout is not None
+    while "pictures go into" not in (line := run.stdout.readline()):
+        assert line, run.communicate()[1]
+    while True:
+        run.send_signal(signal.SIGINT)
+        try:
+            _, err = run.communicate(timeout=0.2)
+            break
+        except subprocess.TimeoutExpired:
+            continue
+    assert run.returncode in (130, -signal.SIGINT)
+    said = [line for line in err.splitlines() if "calibrating from what was kept" not in line]
+    assert said == ["bikeped: interrupted"], err
 
 
 @pytest.mark.parametrize(

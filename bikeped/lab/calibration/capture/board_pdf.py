@@ -1,153 +1,169 @@
-"""A checkerboard to print: a PDF page of vectors, with a ruler to hold a real one against.
+"""A checkerboard to print: a PDF page of vectors, with a ruler to compare with a real one.
 
-Written by hand: the page holds rectangles, lines and a few words in a font that every viewer has,
-and the squares keep their size to a thousandth of a millimetre.
+Boards of the usual sizes are files in `boards/`, drawn by `draw_board`, so that they can be printed
+without matplotlib.
 """
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import Any
 
-from bikeped.errors import CalibrationError
+import numpy as np
+
+from bikeped.errors import CalibrationError, require
 from bikeped.files import write_whole
 from bikeped.lab.calibration.board_view import BoardPattern
 
 #: Page sizes in millimetres, upright.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-_POINT_MM = 72 / 25.4
-_EDGE_MM = 8.0  # what printers leave blank
-_WORDS_MM = 24.0  # for the words and the ruler below the board
+#: Finished boards, `COLUMNSxROWS-PAGE.pdf`, with the largest squares of whole millimetres.
+BOARDS = Path(__file__).with_name("boards")
+_POINT_PER_MM = 72 / 25.4
+_EDGE_MM = 8.0  # printers leave it blank
+_TEXT_MM = 24.0  # for the text and the ruler below the board
 _RULER_MM = 100
 
 
 def write_board_pdf(path: Path, pattern: BoardPattern, *, page: str = "a4") -> float:
     """Writes the page and returns the side of its squares in metres, as drawn.
 
-    CalibrationError as `board_pdf`; BikepedError when the file cannot be written.
+    Raises CalibrationError as `square_size_mm`, BikepedError when the file cannot be written, and
+    MissingPackageError without matplotlib for a board that is not in `BOARDS`.
     """
-    content, square_mm = board_pdf(pattern, page)
-    write_whole(path, content)
+    square_mm = square_size_mm(pattern, page)
+    finished = BOARDS / f"{pattern}-{page.lower()}.pdf"
+    if finished.exists() and square_mm == square_size_mm(_largest(pattern), page):
+        write_whole(path, finished.read_bytes())
+    else:
+        require("matplotlib", extra="calibrate")
+        write_whole(path, draw_board(pattern, page))
     return square_mm / 1000
 
 
-def board_pdf(pattern: BoardPattern, page: str = "a4") -> tuple[bytes, float]:
-    """The PDF's bytes, and the side of its squares in millimetres.
+def square_size_mm(pattern: BoardPattern, page: str = "a4") -> float:
+    """The side of the squares in millimetres.
 
-    A square of 1 m, `BoardPattern`'s way of saying that none was given, stands for the largest
-    whole millimetre that fits. The page lies on its side where that suits the board.
+    A square of 1 m, `BoardPattern`'s default, stands for the largest whole millimetre that fits.
     CalibrationError for an unknown page and for squares that do not fit it.
     """
-    size = PAGES.get(page.lower())
-    if size is None:
+    if page.lower() not in PAGES:
         raise CalibrationError(f"page: unknown size {page!r}; use one of {', '.join(PAGES)}")
-    columns, rows = pattern.columns + 1, pattern.rows + 1
-    if min(pattern.columns, pattern.rows) < 3 or max(columns, rows) > 60:
-        raise CalibrationError(
-            f"--pattern {pattern.columns}x{pattern.rows}: a board has 3 to 59 inner corners a side"
-        )
-    ways = [size, size[::-1]]
-    most = [_largest_mm(columns, rows, way) for way in ways]
-    wide, high = ways[0] if most[0] >= most[1] else ways[1]
-    largest = max(most)
-    square = int(largest) if pattern.square_m == 1.0 else pattern.square_m * 1000
+    if not 3 <= min(pattern.columns, pattern.rows) <= max(pattern.columns, pattern.rows) < 60:
+        raise CalibrationError(f"--pattern {pattern}: a board has 3 to 59 inner corners a side")
+    largest = max(_largest_mm(pattern, way) for way in _ways(page))
+    square = float(int(largest)) if pattern == _largest(pattern) else pattern.square_m * 1000
     if not 2 <= square <= largest:
         raise CalibrationError(
-            f"--square {square / 1000:g}: {columns} x {rows} squares of {square:g} mm do not fit "
-            f"on {page.upper()}, which takes 2 to {largest:.1f} mm; without --square it takes the "
-            "largest"
+            f"--square {square / 1000:g}: {pattern.columns + 1} x {pattern.rows + 1} squares of "
+            f"{square:g} mm do not fit on {page.upper()}, which takes 2 to {largest:.1f} mm; "
+            "without --square it takes the largest"
         )
-    marks = _board(columns, rows, square, wide, high) + _ruler(high)
-    marks += _words(pattern, square, page, high)
-    return _document("\n".join(marks).encode("latin-1"), wide, high), float(square)
+    return square
 
 
-def _largest_mm(columns: int, rows: int, page: tuple[float, float]) -> float:
+def draw_board(pattern: BoardPattern, page: str = "a4") -> bytes:
+    """The PDF of one page, upright or on its side as suits the board; the same bytes each time."""
+    import matplotlib as mpl
+    from matplotlib.backends import backend_pdf
+    from matplotlib.figure import Figure
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    square = square_size_mm(pattern, page)
+    wide, high = max(_ways(page), key=lambda way: _largest_mm(pattern, way))
+    inches = (wide / 25.4, high / 25.4)
+    left = (wide - (pattern.columns + 1) * square) / 2
+    bottom = _EDGE_MM + _TEXT_MM + (high - 2 * _EDGE_MM - _TEXT_MM) / 2
+    bottom -= (pattern.rows + 1) * square / 2
+    out = io.BytesIO()
+    # Core fonts need no embedding, and uncompressed streams do not depend on zlib's version.
+    settings: dict[str, Any] = {
+        **mpl.rcParamsDefault,
+        "pdf.use14corefonts": True,
+        "pdf.compression": 0,
+        "font.family": "Helvetica",
+    }
+    with mpl.rc_context(settings):
+        figure = Figure(figsize=inches, dpi=72)
+        figure.patch.set_visible(False)
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, wide), ylim=(0, high))
+        axes.set_axis_off()
+        # One outline a square: neighbours touch at their corners and nowhere else.
+        corners = square * np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)])
+        squares = [
+            Outline(corners + np.array([x, y]), closed=True)
+            for row in range(pattern.rows + 1)
+            for column in range((pattern.rows - row) % 2, pattern.columns + 1, 2)
+            for x, y in [(left + column * square, bottom + row * square)]
+        ]
+        board = Outline.make_compound_path(*squares)
+        axes.add_patch(PathPatch(board, facecolor="black", linewidth=0))
+        base, start = _EDGE_MM + 13, _EDGE_MM + 2
+        lines = [Outline([(start, base), (start + _RULER_MM, base)])]
+        for tick in range(_RULER_MM + 1):
+            length = 4.0 if tick % 10 == 0 else 3.0 if tick % 5 == 0 else 2.0
+            lines.append(Outline([(start + tick, base), (start + tick, base + length)]))
+        ruler = Outline.make_compound_path(*lines)
+        axes.add_patch(PathPatch(ruler, fill=False, linewidth=0.15 * _POINT_PER_MM))
+        for x, y, size, text in _texts(pattern, square, page, start, base):
+            axes.text(x, y, text, fontsize=size)
+        undated = dict.fromkeys(("CreationDate", "Creator", "Producer"))
+        pdf: Any = backend_pdf  # its parts are not typed
+        file = pdf.PdfFile(out, metadata=undated)
+        file.newPage(*inches)
+        figure.draw(pdf.RendererPdf(file, 72, inches[1], inches[0]))
+        file.endStream()
+        # Viewers that honour it print at 100 % without being asked.
+        file.writeObject(
+            file.rootObject,
+            {
+                "Type": pdf.Name("Catalog"),
+                "Pages": file.pagesObject,
+                "ViewerPreferences": {"PrintScaling": pdf.Name("None")},
+            },
+        )
+        file.finalize()
+        file.close()
+    return out.getvalue()
+
+
+def _largest(pattern: BoardPattern) -> BoardPattern:
+    return BoardPattern(pattern.columns, pattern.rows)
+
+
+def _ways(page: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    size = PAGES[page.lower()]
+    return size, (size[1], size[0])
+
+
+def _largest_mm(pattern: BoardPattern, page: tuple[float, float]) -> float:
+    # Half a square of white around the outer ones: without it they cannot be told apart.
     return min(
-        # Half a square of white round the outer ones: without it they cannot be told apart.
-        (page[0] - 2 * _EDGE_MM) / (columns + 1),
-        (page[1] - 2 * _EDGE_MM - _WORDS_MM) / (rows + 1),
+        (page[0] - 2 * _EDGE_MM) / (pattern.columns + 2),
+        (page[1] - 2 * _EDGE_MM - _TEXT_MM) / (pattern.rows + 2),
     )
 
 
-def _board(columns: int, rows: int, square: float, wide: float, high: float) -> list[str]:
-    left = (wide - columns * square) / 2
-    top = _EDGE_MM + (high - 2 * _EDGE_MM - _WORDS_MM - rows * square) / 2
-    marks = ["0 g"]
-    for row in range(rows):
-        for column in range(row % 2, columns, 2):
-            # One rectangle a square: neighbours touch at their corners and nowhere else.
-            x, y = left + column * square, high - top - (row + 1) * square
-            marks.append(f"{_pt(x)} {_pt(y)} {_pt(square)} {_pt(square)} re")
-    return [*marks, "f"]
-
-
-def _ruler(high: float) -> list[str]:
-    """100 mm with a tick every millimetre, longer every five and ten; y counts from below."""
-    base, left = _EDGE_MM + 13, _EDGE_MM + 2
-    marks = [f"0 G {_pt(0.15)} w"]
-    for tick in range(_RULER_MM + 1):
-        length = 4.0 if tick % 10 == 0 else 3.0 if tick % 5 == 0 else 2.0
-        x = left + tick
-        marks.append(f"{_pt(x)} {_pt(base)} m {_pt(x)} {_pt(base + length)} l")
-    marks.append(f"{_pt(left)} {_pt(base)} m {_pt(left + _RULER_MM)} {_pt(base)} l S")
-    marks += [
-        _text(left + tick - 0.65 * len(str(tick)), base + 4.6, 7, str(tick))
-        for tick in range(0, _RULER_MM + 1, 10)
-    ]
-    marks.append(_text(left + _RULER_MM + 4, base + 0.5, 8, "mm: 100 on a real ruler, or the"))
-    marks.append(_text(left + _RULER_MM + 4, base - 3.0, 8, "printer has changed the size."))
-    return marks
-
-
-def _words(pattern: BoardPattern, square: float, page: str, high: float) -> list[str]:
+def _texts(
+    pattern: BoardPattern, square: float, page: str, start: float, base: float
+) -> list[tuple[float, float, float, str]]:
+    """Position in mm, size in points, and text: the ruler's numbers, and what to measure."""
     count = max(pattern.columns, pattern.rows)
     what = (
-        f"bikeped calibration board, --pattern {pattern.columns}x{pattern.rows}, squares of "
-        f"{square:g} mm as drawn, {page.upper()}. Print at 100 %, not fitted to the page; glue it "
-        "flat onto a stiff plate."
+        f"bikeped calibration board, --pattern {pattern}, squares of {square:g} mm as drawn, "
+        f"{page.upper()}. Print at 100 %, not fitted to the page; glue it flat onto a stiff plate."
     )
     measure = (
         f"Then measure {count} squares in a row with a ruler, divide by {count}, and pass the side "
         f"of one in metres: --square {square / 1000:g} if it is exactly as drawn."
     )
+    ticks = range(0, _RULER_MM + 1, 10)
     return [
-        _text(_EDGE_MM + 2, _EDGE_MM + 5.5 - 4.0 * number, 7.5, line)
-        for number, line in enumerate((what, measure))
+        *((start + tick - 0.65 * len(str(tick)), base + 4.6, 7.0, str(tick)) for tick in ticks),
+        (start + _RULER_MM + 4, base + 0.5, 8.0, "mm: 100 on a real ruler, or the"),
+        (start + _RULER_MM + 4, base - 3.0, 8.0, "printer has changed the size."),
+        (start, _EDGE_MM + 5.5, 7.5, what),
+        (start, _EDGE_MM + 1.5, 7.5, measure),
     ]
-
-
-def _text(x_mm: float, y_mm: float, size_pt: float, words: str) -> str:
-    safe = words.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
-    return f"BT /F1 {size_pt:g} Tf {_pt(x_mm)} {_pt(y_mm)} Td ({safe}) Tj ET"
-
-
-def _pt(mm: float) -> str:
-    return f"{mm * _POINT_MM:.4f}"
-
-
-def _document(content: bytes, wide: float, high: float) -> bytes:
-    """A PDF 1.4 file of one page: catalogue, pages, page, font, content, and where each begins."""
-    box = f"[0 0 {_pt(wide)} {_pt(high)}]"
-    # Viewers that honour it print at 100 % on their own.
-    parts = [
-        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /Contents 5 0 R "
-        "/Resources << /Font << /F1 4 0 R >> >> >>".encode(),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
-        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(content), content),
-    ]
-    out = bytearray(b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n")
-    begins = []
-    for number, part in enumerate(parts, 1):
-        begins.append(len(out))
-        out += b"%d 0 obj\n%s\nendobj\n" % (number, part)
-    table = len(out)
-    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(parts) + 1)
-    for begin in begins:
-        out += b"%010d 00000 n \n" % begin
-    out += b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (
-        len(parts) + 1,
-        table,
-    )
-    return bytes(out)

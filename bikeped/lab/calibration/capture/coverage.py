@@ -1,41 +1,35 @@
-"""Which parts of the image circle the boards have covered, and what to photograph next, in words.
+"""Coverage of the image circle by the boards, and advice on what to photograph next.
 
-The circle is cut into a middle and rings of sectors, each about twenty degrees wide: a lens is only
-known where corners were seen, and the rim is where people forget to hold the board.
+The circle is divided into a middle and rings of sectors, each about twenty degrees wide: a lens is
+only known where corners were observed, and boards at the rim are the ones most often missing.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bikeped.geometry import Lens
 from bikeped.lab.calibration.board_view import BoardView
-from bikeped.types import BoolArray, FloatArray
+from bikeped.types import FloatArray, IntArray
 
-#: A part is covered by so many corners, from at least so many pictures.
-WANTED_CORNERS, WANTED_PICTURES = 12, 2
+#: A sector is covered by so many corners, from at least so many images.
+WANTED_CORNERS, WANTED_IMAGES = 12, 2
 _RING_DEG = 20.0
-_SECTORS = 8
-_WAYS = (
-    "right",
-    "lower right",
-    "bottom",
-    "lower left",
-    "left",
-    "upper left",
-    "top",
-    "upper right",
+#: Around the axis, clockwise from the right.
+_DIRECTIONS = (
+    *("right", "lower right", "bottom", "lower left"),
+    *("left", "upper left", "top", "upper right"),
 )
-_EXISTS = 0.4  # of a part must lie on the picture
+_EXISTS = 0.4  # of a sector must lie on the image
 
 
 @dataclass(frozen=True)
-class Part:
-    """One part of the circle: angles from the axis and round it (clockwise from right), radians."""
+class CircleSector:
+    """One part of the circle: angles from and around the axis (clockwise from right), radians."""
 
     from_rad: float
     to_rad: float
@@ -43,42 +37,53 @@ class Part:
     stop_rad: float
     where: str  #: `the middle`, `upper left, near the rim`
     corners: int = 0
-    pictures: int = 0
+    images: int = 0
 
     @property
     def covered(self) -> bool:
-        return self.corners >= WANTED_CORNERS and self.pictures >= WANTED_PICTURES
+        return self.corners >= WANTED_CORNERS and self.images >= WANTED_IMAGES
 
     @property
     def missing(self) -> float:
-        """1 where nothing was seen, 0 where it is covered."""
-        return 1 - min(self.corners / WANTED_CORNERS, self.pictures / WANTED_PICTURES, 1.0)
+        """1 without any corner, 0 where it is covered."""
+        return 1 - min(self.corners / WANTED_CORNERS, self.images / WANTED_IMAGES, 1.0)
+
+    def advice(self) -> str:
+        """What to photograph here, in one line."""
+        low, high = math.degrees(self.from_rad), math.degrees(self.to_rad)
+        known = "no corner yet"
+        if self.corners:
+            known = f"{_count(self.corners, 'corner')} in {_count(self.images, 'picture')}"
+        how = "close, and turned toward the lens" if high > 60 else "tilted by some 30 degrees"
+        return (
+            f"{self.where} ({low:.0f} to {high:.0f} degrees from the axis): {known}; hold the "
+            f"board there, {how}"
+        )
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """All parts of the circle that lie on the picture."""
+    """All sectors of the circle that lie on the image."""
 
-    parts: Sequence[Part]
+    sectors: Sequence[CircleSector]
 
     @property
     def share(self) -> float:
-        """Share of the parts that are covered."""
-        return sum(part.covered for part in self.parts) / max(len(self.parts), 1)
+        """Share of the sectors that are covered."""
+        return sum(sector.covered for sector in self.sectors) / max(len(self.sectors), 1)
 
     @property
-    def gaps(self) -> list[Part]:
-        """Parts that are not covered, those to photograph first at the start: the emptiest, and of
-        these the ones next to the rim."""
-        open_parts = [part for part in self.parts if not part.covered]
-        return sorted(open_parts, key=lambda part: (-part.missing, -part.to_rad))
+    def gaps(self) -> list[CircleSector]:
+        """Sectors that are not covered: the emptiest first, of these those at the rim."""
+        gaps = [sector for sector in self.sectors if not sector.covered]
+        return sorted(gaps, key=lambda sector: (-sector.missing, -sector.to_rad))
 
     def advice(self, most: int = 4) -> list[str]:
-        """What to photograph next, at most so many lines, for the person with the board."""
-        return [_advice(part) for part in self.gaps[:most]]
+        """What to photograph next, at most so many lines."""
+        return [sector.advice() for sector in self.gaps[:most]]
 
 
-def cover(
+def measure_coverage(
     views: Iterable[BoardView],
     lens: Lens,
     centre_px: tuple[float, float],
@@ -86,53 +91,53 @@ def cover(
 ) -> Coverage:
     """The coverage by `views` of what a lens shows; all in the views' pixels.
 
-    `lens.max_theta_rad` is half the field of view; `window_px` (u0, v0, u1, v1) is what exists of
-    the picture. A lens that is only about right serves as well.
+    `lens.max_theta_rad` is half the field of view; `window_px` (u0, v0, u1, v1) is the part of the
+    image that exists. An approximate lens will do.
     """
-    parts = empty_parts(lens, centre_px, window_px)
-    corners, pictures = np.zeros(len(parts), np.int64), np.zeros(len(parts), np.int64)
-    for view in views:
-        offset = view.uv_px - np.array(centre_px)
-        theta = lens.theta(np.hypot(offset[:, 0], offset[:, 1]))
-        phi = np.arctan2(offset[:, 1], offset[:, 0])
-        for number, part in enumerate(parts):
-            count = int(inside(part, theta, phi).sum())
-            corners[number] += count
-            pictures[number] += count > 0
+    sectors = circle_sectors(lens, centre_px, window_px)
+    counts = [corner_counts(sectors, view.uv_px, lens, centre_px) for view in views]
+    found = np.array(counts, np.int64).reshape(-1, len(sectors))
+    corners, images = found.sum(0), (found > 0).sum(0)
     return Coverage(
         [
-            Part(p.from_rad, p.to_rad, p.start_rad, p.stop_rad, p.where, int(c), int(n))
-            for p, c, n in zip(parts, corners, pictures, strict=True)
+            replace(sector, corners=int(c), images=int(n))
+            for sector, c, n in zip(sectors, corners, images, strict=True)
         ]
     )
 
 
-def inside(part: Part, theta: FloatArray, phi: FloatArray) -> BoolArray:
-    """Which directions lie in a part."""
-    width = part.stop_rad - part.start_rad
-    turned = np.mod(phi - part.start_rad, 2 * math.pi)
+def corner_counts(
+    sectors: Sequence[CircleSector],
+    uv_px: FloatArray,
+    lens: Lens,
+    centre_px: tuple[float, float],
+) -> IntArray:
+    """[sectors] how many of the corners `uv_px` [n, 2] lie in each sector."""
+    offset = uv_px - np.array(centre_px)
+    theta = lens.theta(np.hypot(offset[:, 0], offset[:, 1]))
+    phi = np.arctan2(offset[:, 1], offset[:, 0])
+    bounds = [(s.from_rad, s.to_rad, s.start_rad, s.stop_rad) for s in sectors]
+    low, high, start, stop = np.array(bounds).reshape(-1, 4).T[..., None]
     with np.errstate(invalid="ignore"):
-        ring = (theta >= part.from_rad) & (theta < part.to_rad)
-    return np.asarray(ring & (turned < width))
+        ring = (theta >= low) & (theta < high)
+    return np.asarray((ring & (np.mod(phi - start, 2 * math.pi) < stop - start)).sum(1))
 
 
-def empty_parts(
+def circle_sectors(
     lens: Lens, centre_px: tuple[float, float], window_px: tuple[float, float, float, float]
-) -> list[Part]:
-    """The parts of the circle that lie on the picture, nothing seen in any."""
+) -> list[CircleSector]:
+    """The sectors of the circle that lie on the image, without corners."""
     half = lens.max_theta_rad
     rings = max(2, round(math.degrees(half) / _RING_DEG))
-    edges = np.linspace(0, half, rings + 1)
-    parts = [Part(0.0, float(edges[1]), 0.0, 2 * math.pi, "the middle")]
-    step = 2 * math.pi / _SECTORS
+    edges = [float(edge) for edge in np.linspace(0, half, rings + 1)]
+    step = 2 * math.pi / len(_DIRECTIONS)
+    sectors = [CircleSector(0.0, edges[1], 0.0, 2 * math.pi, "the middle")]
     for ring in range(1, rings):
-        for sector, way in enumerate(_WAYS):
-            start = (sector - 0.5) * step
-            where = f"{way}, {_depth(ring, rings)}"
-            parts.append(
-                Part(float(edges[ring]), float(edges[ring + 1]), start, start + step, where)
-            )
-    return [part for part in parts if _on_picture(part, lens, centre_px, window_px) > _EXISTS]
+        for number, direction in enumerate(_DIRECTIONS):
+            start = (number - 0.5) * step
+            where = f"{direction}, {_depth(ring, rings)}"
+            sectors.append(CircleSector(edges[ring], edges[ring + 1], start, start + step, where))
+    return [s for s in sectors if _share_on_image(s, lens, centre_px, window_px) > _EXISTS]
 
 
 def _depth(ring: int, rings: int) -> str:
@@ -143,33 +148,21 @@ def _depth(ring: int, rings: int) -> str:
     return "beside the middle" if ring == 1 else "half-way out"
 
 
-def _on_picture(
-    part: Part,
+def _share_on_image(
+    sector: CircleSector,
     lens: Lens,
     centre_px: tuple[float, float],
     window_px: tuple[float, float, float, float],
 ) -> float:
     share = (np.arange(8) + 0.5) / 8
     theta, phi = np.meshgrid(
-        part.from_rad + share * (part.to_rad - part.from_rad),
-        part.start_rad + share * (part.stop_rad - part.start_rad),
+        sector.from_rad + share * (sector.to_rad - sector.from_rad),
+        sector.start_rad + share * (sector.stop_rad - sector.start_rad),
     )
     radius = lens.radius(theta)
     u, v = centre_px[0] + radius * np.cos(phi), centre_px[1] + radius * np.sin(phi)
     u0, v0, u1, v1 = window_px
     return float(np.mean((u >= u0) & (u < u1) & (v >= v0) & (v < v1)))
-
-
-def _advice(part: Part) -> str:
-    low, high = math.degrees(part.from_rad), math.degrees(part.to_rad)
-    seen = "no corner yet"
-    if part.corners:
-        seen = f"{_count(part.corners, 'corner')} in {_count(part.pictures, 'picture')}"
-    how = "close, and turned toward the lens" if high > 60 else "tilted by some 30 degrees"
-    return (
-        f"{part.where} ({low:.0f} to {high:.0f} degrees from the axis): {seen}; hold the board "
-        f"there, {how}"
-    )
 
 
 def _count(number: int, what: str) -> str:

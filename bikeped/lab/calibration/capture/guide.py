@@ -1,7 +1,7 @@
-"""Guides a person with a board before a live camera: what was seen, what is kept, what comes next.
+"""Guides a person with a board before a live camera: which boards to keep, and what to do next.
 
-No camera, clock or screen in here: frames and their times come in, a verdict in words comes out.
-`live_session.py` runs it on a source, `live_page.py` shows it in a browser.
+No camera, clock or screen in here: frames and their times come in, verdicts come out.
+`live_session` runs it on a source, `live_page` shows it in a browser.
 """
 
 from __future__ import annotations
@@ -13,23 +13,25 @@ import numpy as np
 
 from bikeped.geometry import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
-from bikeped.lab.calibration.capture.coverage import Coverage, Part, cover, inside
-from bikeped.lab.calibration.corners.board_check import Checked
-from bikeped.lab.calibration.corners.find_boards import check_pattern, find_board
+from bikeped.lab.calibration.capture.coverage import Coverage, corner_counts, measure_coverage
+from bikeped.lab.calibration.corners.board_check import DetectedBoard, rms_shift_px
+from bikeped.lab.calibration.corners.board_detector import check_pattern, detect_board
+from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.types import FloatArray, ImageArray
 
 FEWEST, MOST = 12, 40
 #: Enough when this share of the circle is covered, and FEWEST boards are kept.
 ENOUGH_SHARE = 0.85
-_STILL_SHARE = 0.003  # of the picture's width, between two looks
+_STILL_SHARE = 0.003  # of the image's width, between two frames
 _STILL_WITHIN_S = 1.0
 _NEW_SHARE = 0.05  # of the width, from every board that is kept
-_NEW_CORNERS = 4  # in parts that are not covered yet
-_BLUR_TIMES, _BLUR_PX = 1.6, 1.0  # as wide as this many times the sharpest board's edges
+_NEW_CORNERS = 4  # in sectors that are not covered yet
+_BLUR_TIMES, _BLUR_PX = 1.6, 1.0  # edges wider than the sharpest board's by this factor
+_LEAST_COMMON = 4  # corners for a comparison of two boards
 
 
-class Answer(enum.Enum):
-    """What a frame was good for."""
+class FrameStatus(enum.Enum):
+    """What became of a frame."""
 
     NO_BOARD = "no board"
     MOVING = "moving"
@@ -39,18 +41,18 @@ class Answer(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One frame's answer, in words too, and the corners [n, 2] that were found in it."""
+class FrameVerdict:
+    """One frame's status, a text for the person with the board, and the corners [n, 2] found."""
 
-    answer: Answer
-    words: str
+    status: FrameStatus
+    text: str
     uv_px: FloatArray
 
 
-class Guide:
+class CaptureGuide:
     """Keeps sharp, new and well-spread boards of one camera. One thread at a time.
 
-    `lens` and `centre_px` need only be about right: they say where in the circle a board is.
+    `lens` and `centre_px` may be approximate: they only locate a board in the circle.
     """
 
     def __init__(
@@ -65,13 +67,13 @@ class Guide:
         self.pattern, self.width, self.height = pattern, width, height
         self.lens, self.centre_px = lens, centre_px
         self.kept: list[BoardView] = []
-        self.coverage: Coverage = self._cover()
-        self._last: tuple[float, Checked] | None = None
+        self.coverage: Coverage = self._measure()
+        self._last: tuple[float, DetectedBoard] | None = None
         self._sharpest_px = float("inf")
 
     @property
     def enough(self) -> bool:
-        """Whether a calibration from the kept boards can be trusted all over the circle."""
+        """Whether the kept boards suffice for a calibration all over the circle."""
         spread = self.coverage.share >= ENOUGH_SHARE and len(self.kept) >= FEWEST
         return spread or len(self.kept) >= MOST
 
@@ -83,61 +85,45 @@ class Guide:
         advice = self.coverage.advice(1)
         return advice[0] if advice else "more boards, anywhere, tilted this way and that"
 
-    def look(self, grey: ImageArray, time_s: float) -> Verdict:
-        """Judges one frame [height, width]; the caller saves it when the answer is KEPT.
+    def check_frame(self, grey: ImageArray, time_s: float) -> FrameVerdict:
+        """The verdict on one frame [height, width]; the caller saves it when its status is KEPT.
 
-        `time_s` on any clock that runs evenly. A board is kept at its second still sighting, so
-        that the hand has come to rest.
+        `time_s` on any monotonic clock. A board is kept when it is detected at rest a second time.
         """
-        seen = find_board(grey, self.pattern, thorough=False)
         before, self._last = self._last, None
-        if seen.board is None:
-            return Verdict(Answer.NO_BOARD, seen.why, np.empty((0, 2)))
-        board = seen.board
+        try:
+            board = detect_board(grey, self.pattern, thorough=False)
+        except BoardRefusedError as refused:
+            return FrameVerdict(FrameStatus.NO_BOARD, refused.reason, np.empty((0, 2)))
         self._last = time_s, board
+        status, text = self._classify(board, time_s, before)
+        if status is FrameStatus.KEPT:
+            self.kept.append(BoardView(text, board.ids, board.uv_px, self.width, self.height))
+            self.coverage = self._measure()
+            text = f"kept as {text}"
+        return FrameVerdict(status, text, board.uv_px)
+
+    def _classify(
+        self, board: DetectedBoard, time_s: float, before: tuple[float, DetectedBoard] | None
+    ) -> tuple[FrameStatus, str]:
+        """Status and text of a board; for KEPT the text is its name."""
         self._sharpest_px = min(self._sharpest_px, board.blur_px)
         if board.blur_px > max(_BLUR_PX, _BLUR_TIMES * self._sharpest_px):
-            return Verdict(Answer.BLURRED, "blurred: hold the board still", board.uv_px)
+            return FrameStatus.BLURRED, "blurred: hold the board still"
         if before is None or time_s - before[0] > _STILL_WITHIN_S:
-            return Verdict(Answer.MOVING, "a board: hold it still", board.uv_px)
-        if _moved_px(board, before[1]) > _STILL_SHARE * self.width:
-            return Verdict(Answer.MOVING, "still moving: hold it still", board.uv_px)
-        why_not = self._not_new(board)
-        if why_not:
-            return Verdict(Answer.SEEN, why_not, board.uv_px)
-        name = f"board {len(self.kept) + 1}"
-        self.kept.append(BoardView(name, board.ids, board.uv_px, self.width, self.height))
-        self.coverage = self._cover()
-        return Verdict(Answer.KEPT, f"kept as {name}", board.uv_px)
+            return FrameStatus.MOVING, "a board: hold it still"
+        if rms_shift_px(board, before[1], _LEAST_COMMON) > _STILL_SHARE * self.width:
+            return FrameStatus.MOVING, "still moving: hold it still"
+        shifts = (rms_shift_px(board, view, _LEAST_COMMON) for view in self.kept)
+        if min(shifts, default=float("inf")) < _NEW_SHARE * self.width:
+            return FrameStatus.SEEN, "seen before: move or tilt the board"
+        if len(self.kept) >= FEWEST:
+            gaps = self.coverage.gaps
+            new = corner_counts(gaps, board.uv_px, self.lens, self.centre_px) >= _NEW_CORNERS
+            if not new.any():
+                return FrameStatus.SEEN, "covered already: hold the board elsewhere"
+        return FrameStatus.KEPT, f"board {len(self.kept) + 1}"
 
-    def fills(self, board: Checked) -> list[Part]:
-        """Parts of the circle that are not covered and that this board helps to cover."""
-        offset = board.uv_px - np.array(self.centre_px)
-        theta = self.lens.theta(np.hypot(offset[:, 0], offset[:, 1]))
-        phi = np.arctan2(offset[:, 1], offset[:, 0])
-        return [
-            part
-            for part in self.coverage.gaps
-            if int(inside(part, theta, phi).sum()) >= _NEW_CORNERS
-        ]
-
-    def _not_new(self, board: Checked) -> str:
-        near = min((_moved_px(board, view) for view in self.kept), default=float("inf"))
-        if near < _NEW_SHARE * self.width:
-            return "seen before: move or tilt the board"
-        if len(self.kept) >= FEWEST and not self.fills(board):
-            return "covered already: hold the board elsewhere"
-        return ""
-
-    def _cover(self) -> Coverage:
+    def _measure(self) -> Coverage:
         window = (0.0, 0.0, float(self.width), float(self.height))
-        return cover(self.kept, self.lens, self.centre_px, window)
-
-
-def _moved_px(board: Checked, other: Checked | BoardView) -> float:
-    """Root mean square over the corners that both have; infinite where there are too few."""
-    _, mine, theirs = np.intersect1d(board.ids, other.ids, return_indices=True)
-    if len(mine) < 4:
-        return float("inf")
-    off = board.uv_px[mine] - other.uv_px[theirs]
-    return float(np.sqrt((off**2).sum(1).mean()))
+        return measure_coverage(self.kept, self.lens, self.centre_px, window)

@@ -7,16 +7,23 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration import refusals
+from bikeped.lab.calibration.board_view import BoardPattern, BoardView
+from bikeped.lab.calibration.corners.corner_refinement import (
+    RefinedCorners,
+    is_edge_crossing,
+    refine_corners,
+)
 from bikeped.lab.calibration.corners.local_grid import (
     LocalMap,
-    crossing,
+    crossing_score,
+    grid_positions,
     local_map,
-    misfit,
-    places,
-    repair,
+    nearest_level,
+    neighbour_residual,
+    repair_corners,
 )
-from bikeped.lab.calibration.corners.refine import Refined, fits, refine
+from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
 
 _ROUGH = 0.3  # squares: a candidate's corner further off its neighbours' expectation is wrong ...
@@ -28,91 +35,103 @@ _CROSSES = 0.15  # `crossing` of a corner that can be seen
 
 
 @dataclass(frozen=True)
-class Checked:
+class DetectedBoard:
     """Good corners: `ids` ascending, `uv_px` [n, 2], blur of the edges, and squares' size."""
 
     ids: IntArray
     uv_px: FloatArray
-    blur_px: float
-    spacing_px: float
+    blur_px: float  #: median standard deviation of the edges' smoothing
+    spacing_px: float  #: median of the shorter side of the squares
 
 
-def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> Checked | str:
-    """The corners of a candidate [columns * rows, 2], row by row; or why it is none, in words."""
+def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> DetectedBoard:
+    """The corners of a candidate [columns * rows, 2], row by row.
+
+    BoardRefusedError, with the reason, where it is no board of the pattern.
+    """
     ids: IntArray = np.arange(pattern.count, dtype=np.int64)
-    seen = places(pattern, ids)
-    mended = repair(seen, uv_px, _ROUGH, int(_REPAIRABLE * pattern.count))
-    if mended is None:
-        return "its corners make no regular board"
-    uv = arranged(grey, pattern, mended[0])
-    near = local_map(seen, seen, uv)
-    uv = settled(grey, near, uv)
-    refined = refine(grey, seen, uv)
-    good, expected = good_corners(grey, seen, refined)
+    position = grid_positions(pattern, ids)
+    repaired = repair_corners(position, uv_px, _ROUGH, int(_REPAIRABLE * pattern.count))
+    if repaired is None:
+        raise BoardRefusedError(refusals.IRREGULAR)
+    uv = orient_corners(grey, pattern, repaired)
+    near = local_map(position, position, uv)
+    uv = refine_by_gradient(grey, near, uv)
+    refined = refine_corners(grey, position, uv)
+    good, expected = good_corners(grey, position, refined)
     if not good.all() and good.mean() > 0.5:
-        again = refine(grey, seen, np.where(good[:, None], refined.uv_px, expected))
-        better, _ = good_corners(grey, seen, again)
+        again = refine_corners(grey, position, np.where(good[:, None], refined.uv_px, expected))
+        better, _ = good_corners(grey, position, again)
         if better.sum() > good.sum():
             refined, good = again, better
     if good.mean() < _KEPT:
-        return f"only {int(good.sum())} of {pattern.count} corners can be seen clearly"
-    ids, seen, uv = ids[good], seen[good], refined.uv_px[good]
-    wrong = _goes_on(grey, pattern, seen, uv)
-    if wrong:
-        return wrong
-    if not good.all():  # a wrong corner has told its neighbours a wrong bend
-        refined = refine(grey, seen, uv)
+        raise BoardRefusedError(refusals.too_few_corners(int(good.sum()), pattern))
+    ids, position, uv = ids[good], position[good], refined.uv_px[good]
+    if _continues_beyond(grey, pattern, position, uv):
+        raise BoardRefusedError(refusals.larger_board(pattern))
+    if not good.all():  # a wrong corner gave its neighbours a wrong bend
+        refined = refine_corners(grey, position, uv)
         uv = refined.uv_px
-    spacing = local_map(seen, seen, uv).spacing_px.min(1)
-    return Checked(ids, uv, float(np.median(refined.blur_px)), float(np.median(spacing)))
+    spacing = local_map(position, position, uv).spacing_px.min(1)
+    return DetectedBoard(ids, uv, float(np.median(refined.blur_px)), float(np.median(spacing)))
 
 
-def arranged(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> FloatArray:
-    """The same corners with ids that mean the same in every picture, as far as that can be.
+def rms_shift_px(
+    board: DetectedBoard, other: DetectedBoard | BoardView, least_common: float
+) -> float:
+    """Root mean square distance of the corners that both boards have, in pixels.
+
+    Infinite where they share fewer than `least_common`.
+    """
+    _, mine, theirs = np.intersect1d(board.ids, other.ids, return_indices=True)
+    if len(mine) < least_common:
+        return float("inf")
+    shift = board.uv_px[mine] - other.uv_px[theirs]
+    return float(np.sqrt((shift**2).sum(1).mean()))
+
+
+def orient_corners(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> FloatArray:
+    """The corners ordered so that an id is the same corner in every image, where that is possible.
 
     Columns by rows is never a mirror image. Turned by 180 degrees a board with columns + rows odd
     changes its colours: there corner 0 is the one whose outer square is dark. With columns + rows
     even (8x6) the two ways round look alike; the one is taken whose columns run to the right in the
-    picture (downward, where they run up and down), which is the same corner as long as nobody turns
-    the board by more than 90 degrees. A square pattern is treated likewise.
+    image (downward, where they run up and down), which is the same corner as long as the board is
+    not turned by more than 90 degrees. A square pattern is treated likewise.
     """
     grid: FloatArray = uv_px.reshape(pattern.rows, pattern.columns, 2)
-    if _handed(grid) < 0:
+    if _handedness(grid) < 0:
         grid = grid[:, ::-1]
     ways = [grid, grid[::-1, ::-1]]
     if pattern.columns == pattern.rows:
         ways += [np.rot90(way) for way in ways]
-    dark = [_dark_start(grey, pattern, way) for way in ways]
+    dark = [_starts_dark(grey, pattern, way) for way in ways]
     allowed = [way for way, first in zip(ways, dark, strict=True) if first] or ways
-    best = max(allowed, key=_upright)
+    best = max(allowed, key=_rightward)
     return np.asarray(best.reshape(-1, 2))
 
 
-def _handed(grid: FloatArray) -> float:
+def _handedness(grid: FloatArray) -> float:
     right, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
     return float(np.median(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]))
 
 
-def _upright(grid: FloatArray) -> float:
+def _rightward(grid: FloatArray) -> float:
     along = (grid[:, -1] - grid[:, 0]).mean(0)
     return float(along[0] + 1e-3 * along[1])
 
 
-def _dark_start(grey: ImageArray, pattern: BoardPattern, grid: FloatArray) -> bool:
-    """Whether the outer square beyond corner 0 is dark, told from the squares inside."""
-    middle = (grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:]) / 4
-    at = np.rint(middle).astype(np.intp)
-    level = grey[
-        np.clip(at[..., 1], 0, grey.shape[0] - 1), np.clip(at[..., 0], 0, grey.shape[1] - 1)
-    ].astype(np.float64)
+def _starts_dark(grey: ImageArray, pattern: BoardPattern, grid: FloatArray) -> bool:
+    """Whether the outer square beyond corner 0 is dark, by the squares inside."""
+    level = nearest_level(grey, (grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:]) / 4)
     column, row = np.meshgrid(np.arange(pattern.columns - 1), np.arange(pattern.rows - 1))
     even = (column + row) % 2 == 0
     return bool(level[even].mean() < level[~even].mean())
 
 
-def settled(grey: ImageArray, near: LocalMap, uv: FloatArray) -> FloatArray:
-    """[n, 2] within half a pixel or so, by the gradient method with a window of each corner's own
-    size; `uv` [n, 2] where the detector's guess is better."""
+def refine_by_gradient(grey: ImageArray, near: LocalMap, uv: FloatArray) -> FloatArray:
+    """[n, 2] corners within half a pixel or so, by cv2.cornerSubPix with a window of each corner's
+    own size; `uv` [n, 2] where the detector's guess is better."""
     height, width = grey.shape
     half = np.clip(np.rint(0.2 * near.spacing_px.min(1)), 2, 12).astype(int)
     inside = (uv > 1).all(1) & (uv[:, 0] < width - 2) & (uv[:, 1] < height - 2)
@@ -129,40 +148,42 @@ def settled(grey: ImageArray, near: LocalMap, uv: FloatArray) -> FloatArray:
 
 
 def good_corners(
-    grey: ImageArray, seen: FloatArray, refined: Refined
+    grey: ImageArray, position: FloatArray, refined: RefinedCorners
 ) -> tuple[BoolArray, FloatArray]:
     """[n] which corners are crossings of the right colours where their neighbours expect them, and
-    [n, 2] where that is. `seen` [n, 2] column and row of each."""
-    near = local_map(seen, seen, refined.uv_px)
+    [n, 2] where that is, in pixels. `position` [n, 2]: column and row of each."""
+    near = local_map(position, position, refined.uv_px)
     spacing = near.spacing_px.min(1)
-    colour = crossing(grey, near) * np.where(seen.sum(1) % 2 == 0, 1.0, -1.0)
+    colour = crossing_score(grey, near) * _checker_sign(position)
     if np.median(colour) < 0:
         colour = -colour
-    clear = fits(refined, spacing) & (colour > _CROSSES)
+    clear = is_edge_crossing(refined, spacing) & (colour > _CROSSES)
     if clear.mean() < 0.5:
         return clear, refined.uv_px
-    off, expected = misfit(seen, refined.uv_px, clear)
-    # At an edge the others can only be continued, and a board's corner lies off both ways.
-    share = np.array(_FINE)[_edges_touched(seen)]
-    return np.asarray(clear & (off * spacing < _FINE_PX + share * spacing)), expected
+    off, expected = neighbour_residual(position, refined.uv_px, clear)
+    # At an edge the neighbours can only be extrapolated, at a board's corner in both directions.
+    edges = ((position == position.min(0)) | (position == position.max(0))).sum(1)
+    limit_px = _FINE_PX + np.array(_FINE)[edges] * spacing
+    return np.asarray(clear & (off * spacing < limit_px)), expected
 
 
-def _edges_touched(seen: FloatArray) -> IntArray:
-    return np.asarray(((seen == seen.min(0)) | (seen == seen.max(0))).sum(1), np.int64)
+def _checker_sign(position: FloatArray) -> FloatArray:
+    return np.where(position.sum(1) % 2 == 0, 1.0, -1.0)
 
 
-def _goes_on(grey: ImageArray, pattern: BoardPattern, seen: FloatArray, uv: FloatArray) -> str:
-    """Words for a board that has more corners than the pattern beyond one of its sides."""
+def _continues_beyond(
+    grey: ImageArray, pattern: BoardPattern, position: FloatArray, uv: FloatArray
+) -> bool:
+    """Whether one of the board's sides is followed by another line of corners."""
     columns, rows = pattern.columns, pattern.rows
-    sides = (
+    for side in (
         [(-1, r) for r in range(rows)],
         [(columns, r) for r in range(rows)],
         [(c, -1) for c in range(columns)],
         [(c, rows) for c in range(columns)],
-    )
-    for side in sides:
-        at = np.array(side, np.float64)
-        score = crossing(grey, local_map(at, seen, uv)) * np.where(at.sum(1) % 2 == 0, 1.0, -1.0)
+    ):
+        beyond = np.array(side, np.float64)
+        score = crossing_score(grey, local_map(beyond, position, uv)) * _checker_sign(beyond)
         if (score > 0.4).mean() > 0.7 or (score < -0.4).mean() > 0.7:
-            return f"the board has more inner corners than {columns}x{rows}; correct --pattern"
-    return ""
+            return True
+    return False

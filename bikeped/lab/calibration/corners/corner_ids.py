@@ -1,8 +1,8 @@
-"""Which corners of the board a grid holds: told by its extent, or by the board's own outer edge.
+"""Assigns the board's corner ids to a grid of corners, by its extent or by the board's outer edge.
 
-A grid with all columns and all rows has only one place on the board. With one line too few, an
-edge of the board still says which one is missing: there the outermost squares are followed by the
-paper's white margin. A wrong number is worse than none, so all else is refused, with the reason.
+A grid with all columns and all rows has only one place on the board. With one line missing, an
+edge of the board still shows which one: there the outermost squares are followed by the paper's
+white margin. A wrong id is worse than none, so anything else is refused, with the reason.
 """
 
 from __future__ import annotations
@@ -11,72 +11,70 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bikeped.lab.calibration import refusals
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.corners.grid_growing import Grid
+from bikeped.lab.calibration.corners.grid_growing import CornerGrid
 from bikeped.lab.calibration.corners.local_grid import quadrants, sample
+from bikeped.lab.calibration.refusals import LEAST_IN_LINE, BoardRefusedError
 from bikeped.types import FloatArray, ImageArray, IntArray
 
-#: Corners of an outer line that show it: one or two could be something else.
-LEAST_IN_LINE = 3
-_ENDS_AT = 2  # places where a board is seen to end
-_PINNED_AT = (
-    3  # the same where the end must say which line it is; and of all that can be judged ...
-)
-_PINNED_SHARE = 0.75  # ... this share
-_GOES_ON_AT = 2  # places beyond a line that are crossings, too
-_CLEARLY = 0.5  # of the way from the middle to what light and dark squares are
-_STEP, _TIGHT = 0.3, 0.18  # squares to either side of an outer edge, where it is looked at
+_ENDS_AT = 2  # places at which a board is seen to end
+_EDGE_AT = 3  # the same where the end identifies the line; and of all places that can be judged ...
+_EDGE_SHARE = 0.75  # ... this share
+_CONTINUES_AT = 2  # places beyond a line that are crossings, too
+_CLEARLY = 0.5  # of the way from the middle grey to light and dark squares
+_STEP, _NEAR_STEP = 0.3, 0.18  # squares to either side of an outer edge where grey is sampled
 
 
-def pin(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> IntArray | str:
-    """[n] the ids of a grid's corners; or why they cannot be known, in words.
+def assign_corner_ids(grey: ImageArray, pattern: BoardPattern, grid: CornerGrid) -> IntArray:
+    """[n] the ids of a grid's corners; BoardRefusedError where they cannot be known.
 
-    Ids follow the rule for whole boards (`check.arranged`): never mirrored, the outer square beyond
-    corner 0 dark where the colours can tell, else columns to the right.
+    Ids follow the rule for whole boards (`board_check.orient_corners`): never mirrored, the outer
+    square beyond corner 0 dark where the colours can tell, else columns to the right.
     """
-    whole = _Extent.of(grid, 1)
-    if not _within(whole.size, pattern):
-        return _more(pattern, whole.size)
     wanted = np.array([pattern.columns, pattern.rows])
-    ways: list[_Way] = []
+    size = _GridBounds.of(grid, 1).size
+    if not ((size <= wanted).all() or (size[::-1] <= wanted).all()):
+        raise BoardRefusedError(refusals.larger_board(pattern, size))
+    orientations: list[_Orientation] = []
     reasons: list[str] = []
     for turns in range(4):
         turned = _turned(grid, turns)
-        extent = _Extent.of(turned, LEAST_IN_LINE)
-        if (extent.size > wanted).any() or (extent.size < 1).any():
+        bounds = _GridBounds.of(turned, LEAST_IN_LINE)
+        if (bounds.size > wanted).any() or (bounds.size < 1).any():
             continue
-        first = _first(grey, pattern, turned, extent)
-        if isinstance(first, str):
-            reasons.append(first)
+        try:
+            first = _first_cell(grey, pattern, turned, bounds)
+        except BoardRefusedError as refused:
+            reasons.append(refused.reason)
             continue
-        at = turned.cell - first
-        if (at < 0).any() or (at >= wanted).any():
-            reasons.append("some of its corners lie beyond its white margin: something hides it")
+        position = turned.cell - first
+        if (position < 0).any() or (position >= wanted).any():
+            reasons.append(refusals.BEYOND_MARGIN)
             continue
         dark = bool(first.sum() % 2 == 0) == turned.dark
-        ways.append(_Way(at, dark, extent.size))
-    if not ways:
-        few = f"fewer than {LEAST_IN_LINE} corners of its outer rows and columns can be seen"
-        return reasons[0] if reasons else few
-    allowed = [way for way in ways if way.dark]
-    if not allowed and (ways[0].size < wanted).any():
+        orientations.append(_Orientation(position, dark, bounds.size))
+    if not orientations:
+        raise BoardRefusedError([*reasons, refusals.OUTER_LINES_HIDDEN][0])
+    allowed = [one for one in orientations if one.dark]
+    if not allowed and (orientations[0].size < wanted).any():
         # An edge that is taken for the board's own shifts all by a line, which turns the colours.
-        return _short(pattern, ways[0].size)
-    best = max(allowed or ways, key=lambda way: _upright(grid, way.at))
-    return np.asarray(best.at[:, 1] * pattern.columns + best.at[:, 0], np.int64)
+        raise BoardRefusedError(refusals.ambiguous_place(pattern, orientations[0].size))
+    best = max(allowed or orientations, key=lambda one: _rightward(grid, one.position))
+    return np.asarray(best.position[:, 1] * pattern.columns + best.position[:, 0], np.int64)
 
 
 @dataclass(frozen=True)
-class _Way:
-    """One numbering: places on the board [n, 2], and what speaks for it."""
+class _Orientation:
+    """One numbering of a grid: `position` [n, 2] (column, row) on the board."""
 
-    at: IntArray
-    dark: bool  #: whether the outer square beyond corner 0 is
+    position: IntArray
+    dark: bool  #: whether the outer square beyond corner 0 is dark, as it must be
     size: IntArray  #: columns and rows in sight: with fewer than all, an outer edge placed it
 
 
 @dataclass(frozen=True)
-class _Extent:
+class _GridBounds:
     """The first and last column and row that hold enough corners."""
 
     low: IntArray
@@ -87,7 +85,8 @@ class _Extent:
         return np.asarray(self.high - self.low + 1)
 
     @staticmethod
-    def of(grid: Grid, least: int) -> _Extent:
+    def of(grid: CornerGrid, least: int) -> _GridBounds:
+        """Bounds without outer lines of fewer than `least` corners; size 0 where none is left."""
         cell = grid.cell
         while len(cell):
             low, high = cell.min(0), cell.max(0)
@@ -96,99 +95,87 @@ class _Extent:
                 on = cell == line
                 poor |= (on & (on.sum(0) < least)).any(1)
             if not poor.any():
-                return _Extent(low, high)
+                return _GridBounds(low, high)
             cell = cell[~poor]
-        return _Extent(np.zeros(2, np.int64), np.full(2, -1))
+        return _GridBounds(np.zeros(2, np.int64), np.full(2, -1))
 
 
-def _within(size: IntArray, pattern: BoardPattern) -> bool:
-    wanted = [pattern.columns, pattern.rows]
-    return bool((size <= wanted).all() or (size[::-1] <= wanted).all())
-
-
-def _turned(grid: Grid, turns: int) -> Grid:
+def _turned(grid: CornerGrid, turns: int) -> CornerGrid:
     """The same grid counted from another of its four sides; a quarter turn changes the colours."""
     cell = grid.cell
     for _ in range(turns):
         cell = np.stack([cell[:, 1], -cell[:, 0]], axis=-1)
-    return Grid(cell, grid.uv_px, grid.dark ^ bool(turns % 2))
+    return CornerGrid(cell, grid.uv_px, grid.dark ^ bool(turns % 2))
 
 
-def _first(grey: ImageArray, pattern: BoardPattern, grid: Grid, extent: _Extent) -> IntArray | str:
-    """[2] the cell that is the board's corner 0; or why that is not known."""
-    out = extent.low.copy()
+def _first_cell(
+    grey: ImageArray, pattern: BoardPattern, grid: CornerGrid, bounds: _GridBounds
+) -> IntArray:
+    """[2] the cell that is the board's corner 0; BoardRefusedError where that is not known."""
+    out = bounds.low.copy()
     wanted = np.array([pattern.columns, pattern.rows])
-    missing = wanted - extent.size
-    if missing.sum() > 1 or (missing.any() and _fits_turned(extent.size, wanted)):
-        return _short(pattern, extent.size)
+    missing = wanted - bounds.size
+    fits_turned = wanted[0] != wanted[1] and bool((bounds.size[::-1] <= wanted).all())
+    if missing.sum() > 1 or (missing.any() and fits_turned):
+        raise BoardRefusedError(refusals.ambiguous_place(pattern, bounds.size))
     for axis in (0, 1):
-        ends = [_End.of(grey, grid, extent, axis, way) for way in (-1, 1)]
+        edges = [_BoardEdge.of(grey, grid, bounds, axis, way) for way in (-1, 1)]
         if missing[axis]:
-            before, after = (end.pins for end in ends)
+            before, after = (edge.is_outer_edge for edge in edges)
             if before == after:
-                return _short(pattern, extent.size)
+                raise BoardRefusedError(refusals.ambiguous_place(pattern, bounds.size))
             out[axis] -= int(after)
-        elif any(end.goes_on >= _GOES_ON_AT for end in ends):
-            return _more(pattern, extent.size + (np.arange(2) == axis))
-        elif all(end.ends < _ENDS_AT for end in ends):
-            what = ("columns", "rows")[axis]
-            return (
-                f"{wanted[axis]} {what} are in sight, but no white margin on either side of them: "
-                "there may be more; show an outer edge of the board"
-            )
+        elif any(edge.continues >= _CONTINUES_AT for edge in edges):
+            larger = bounds.size + (np.arange(2) == axis)
+            raise BoardRefusedError(refusals.larger_board(pattern, larger))
+        elif all(edge.ends < _ENDS_AT for edge in edges):
+            raise BoardRefusedError(refusals.no_margin(int(wanted[axis]), axis))
     return out
 
 
-def _fits_turned(size: IntArray, wanted: IntArray) -> bool:
-    """Whether a grid fits with columns for rows, too, where that is another place."""
-    return wanted[0] != wanted[1] and bool((size[::-1] <= wanted).all())
-
-
 @dataclass(frozen=True)
-class _End:
+class _BoardEdge:
     """What lies beyond an outer line of a grid, counted over the line's corners.
 
-    `seen`: where the outer squares are; of these `goes_on`: with a crossing beyond, `ends`: with
-    light on both sides beyond, `white`: the same right at the squares' edge, as a margin is.
+    `visible`: the outer squares are recognised; of these `continues`: with a crossing beyond,
+    `ends`: with light on both sides beyond, `white`: the same right at the squares' edge, as a
+    margin is.
     """
 
-    seen: int
-    goes_on: int
+    visible: int
+    continues: int
     ends: int
     white: int
 
     @property
-    def pins(self) -> bool:
+    def is_outer_edge(self) -> bool:
         """Whether this is the board's own edge."""
-        return self.white >= max(_PINNED_AT, _PINNED_SHARE * self.seen)
+        return self.white >= max(_EDGE_AT, _EDGE_SHARE * self.visible)
 
     @staticmethod
-    def of(grey: ImageArray, grid: Grid, extent: _Extent, axis: int, way: int) -> _End:
+    def of(
+        grey: ImageArray, grid: CornerGrid, bounds: _GridBounds, axis: int, way: int
+    ) -> _BoardEdge:
         """Beyond the last line of columns (`axis` 0) or rows (1), `way` -1: the first."""
-        line = extent.high[axis] if way > 0 else extent.low[axis]
+        line = bounds.high[axis] if way > 0 else bounds.low[axis]
         last = grid.cell[grid.cell[:, axis] == line]
         outward = np.zeros(2, np.int64)
         outward[axis] = way
         beyond = last + outward
         near = grid.near(beyond)
         dark, light = _levels(grey, grid, last)
-        seen, white = np.ones(len(last), np.bool_), np.ones(len(last), np.bool_)
-        for share in (_TIGHT, _STEP):
+        visible, white = np.ones(len(last), np.bool_), np.ones(len(last), np.bool_)
+        for share in (_NEAR_STEP, _STEP):
             inner, outer = (_steps(axis, side * way, share) for side in (-1, 1))
             here, there = (
                 _shade(sample(grey, near.at_steps(step)), dark, light) for step in (inner, outer)
             )
-            seen &= (here * grid.lights(beyond, inner) > _CLEARLY).all(1)
+            visible &= (here * grid.lights(beyond, inner) > _CLEARLY).all(1)
             # As light as the board's own squares: the same paper, not a sheet or a glare over it.
             white &= (np.abs(there - 1) < 1 - _CLEARLY).all(1)
             crosses = (there * grid.lights(beyond, outer) > _CLEARLY).all(1)
             ends = (there > 0).all(1)
-        return _End(
-            int(seen.sum()),
-            int((seen & crosses).sum()),
-            int((seen & ends).sum()),
-            int((seen & white).sum()),
-        )
+        return _BoardEdge(*(int((visible & how).sum()) for how in (True, crosses, ends, white)))
 
 
 def _shade(level: FloatArray, dark: FloatArray, light: FloatArray) -> FloatArray:
@@ -205,40 +192,16 @@ def _steps(axis: int, way: int, share: float) -> FloatArray:
     return step
 
 
-def _levels(grey: ImageArray, grid: Grid, cell: IntArray) -> tuple[FloatArray, FloatArray]:
+def _levels(grey: ImageArray, grid: CornerGrid, cell: IntArray) -> tuple[FloatArray, FloatArray]:
     """[n] grey levels of dark and light squares about corners; NaN at the picture's edge."""
     around = quadrants(grey, grid.near(cell))
     pairs = np.stack([around[:, [0, 3]].mean(1), around[:, [1, 2]].mean(1)])
     return np.asarray(pairs.min(0)), np.asarray(pairs.max(0))
 
 
-def _upright(grid: Grid, at: IntArray) -> float:
-    """How far columns run to the right in the picture, or downward: as `check.arranged` has it."""
-    place = {(int(c), int(r)): uv for (c, r), uv in zip(at, grid.uv_px, strict=True)}
-    steps = [place[c + 1, r] - uv for (c, r), uv in place.items() if (c + 1, r) in place]
+def _rightward(grid: CornerGrid, position: IntArray) -> float:
+    """How far columns run to the right in the image, or downward: as `orient_corners` has it."""
+    uv_at = {(int(c), int(r)): uv for (c, r), uv in zip(position, grid.uv_px, strict=True)}
+    steps = [uv_at[c + 1, r] - uv for (c, r), uv in uv_at.items() if (c + 1, r) in uv_at]
     along = np.mean(steps, axis=0) if steps else np.zeros(2)
     return float(along[0] + 1e-3 * along[1])
-
-
-def _short(pattern: BoardPattern, size: IntArray) -> str:
-    """Words for a grid that fits several places."""
-    wanted = np.array([pattern.columns, pattern.rows])
-    if (size > wanted).any() or (size < size[::-1]).any() != (wanted < wanted[::-1]).any():
-        size = size[::-1] if (size[::-1] <= wanted).all() else size
-    parts = [
-        f"{have} of {all_} {what}"
-        for have, all_, what in zip(size, wanted, ("columns", "rows"), strict=True)
-        if have < all_
-    ]
-    return (
-        f"{' and '.join(parts)} of the {pattern.columns}x{pattern.rows} board are in sight: which "
-        f"ones cannot be known; show the whole width and height ({LEAST_IN_LINE} corners of each "
-        "outer row and column at least), others may be hidden"
-    )
-
-
-def _more(pattern: BoardPattern, size: IntArray) -> str:
-    return (
-        f"the board has more inner corners than {pattern.columns}x{pattern.rows} (at least "
-        f"{max(size)}x{min(size)}); correct --pattern"
-    )

@@ -1,6 +1,6 @@
-"""Grids of crossings, grown neighbour by neighbour, whatever hides the rest of the board.
+"""Grids of corners grown from saddle points, neighbour by neighbour, around what hides the rest.
 
-A grid counts its own columns and rows: which ones of the board they are, `partial.py` says.
+A grid counts its own columns and rows; `corner_ids` finds out which ones of the board they are.
 """
 
 from __future__ import annotations
@@ -12,24 +12,33 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from bikeped.lab.calibration.corners.local_grid import LocalMap, crossing, local_map, misfit
-from bikeped.lab.calibration.corners.saddle_points import Saddles, links, saddles
+from bikeped.lab.calibration.corners.local_grid import (
+    LocalMap,
+    crossing_score,
+    local_map,
+    neighbour_residual,
+)
+from bikeped.lab.calibration.corners.saddle_points import (
+    SaddlePoints,
+    find_saddle_points,
+    link_neighbours,
+)
 from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
 
 _FEWEST = 6  # corners that a grid begins with
 _GRIDS = 3  # of a picture, the largest
-_CLEAN = 0.3  # `crossing` of a corner that is one
+_CLEAR = 0.3  # `crossing_score` of a corner
 _OFF = 0.2  # squares from where the neighbours expect a corner
 _SNAP = 0.25  # the same for a new one, which they can only continue to
 _PARALLEL = np.cos(np.radians(25.0))  # its edges and theirs
-_NEAR = 3  # columns and rows to either side that tell where a new corner must lie ...
-_TOLD_BY = 5  # ... by at least so many corners
+_NEAR = 3  # columns and rows to either side that predict where a new corner lies ...
+_KNOWN_BY = 5  # ... by at least so many corners
 _ROUNDS = 40
 _STEPS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 
 
 @dataclass(frozen=True)
-class Grid:
+class CornerGrid:
     """Corners `cell` [n, 2] (column, row; whole numbers, from anywhere) at `uv_px` [n, 2].
 
     Columns and rows are not mirrored: rows run down where columns run to the right. `dark` says
@@ -44,7 +53,7 @@ class Grid:
         return len(self.cell)
 
     def sign(self, cell: IntArray) -> FloatArray:
-        """[n] what `crossing` must say of the colours at these cells: 1 or -1."""
+        """[n] the sign of `crossing_score` at cells [n, 2] of this grid's colours: 1 or -1."""
         even = cell.sum(1) % 2 == 0
         return np.where(even == self.dark, 1.0, -1.0)
 
@@ -54,21 +63,21 @@ class Grid:
         return np.asarray(-self.sign(cell)[:, None] * np.sign(step[:, 0] * step[:, 1]))
 
     def near(self, cell: IntArray) -> LocalMap:
-        """How pixels run with squares about any cells [m, 2], also empty ones."""
+        """The local map from squares to pixels about any cells [m, 2], also empty ones."""
         return local_map(cell.astype(np.float64), self.cell.astype(np.float64), self.uv_px)
 
 
-def grids(grey: ImageArray) -> list[Grid]:
+def find_grids(grey: ImageArray) -> list[CornerGrid]:
     """The largest grids in a picture, largest first, none with a corner of another."""
-    points = saddles(grey)
+    points = find_saddle_points(grey)
     taken = np.zeros(len(points), np.bool_)
     out = []
-    for number, start in enumerate(_components(points, links(grey, points))):
+    for number, start in enumerate(_components(points, link_neighbours(grey, points))):
         if number == _GRIDS:
             break
         if taken[start.point].any():
             continue
-        grown = _grown(grey, points, start)
+        grown = _grow(grey, points, start)
         if grown is not None:
             taken[grown.point] = True
             out.append(grown.grid(points))
@@ -76,34 +85,25 @@ def grids(grey: ImageArray) -> list[Grid]:
 
 
 @dataclass(frozen=True)
-class _Growing:
-    """Cells [n, 2], which saddle each holds [n], and the type of cell (0, 0)'s edge along rows."""
+class _SaddleGrid:
+    """A grid while it grows: cells [n, 2], and which saddle point each holds [n].
+
+    The edge along rows is of type 0 at cell (0, 0), and the types alternate.
+    """
 
     cell: IntArray
     point: IntArray
-    kind: int
 
-    def kinds(self, cell: IntArray) -> IntArray:
-        """[n] the type that an edge along a row has at these cells: it alternates."""
-        return np.asarray((cell.sum(1) + self.kind) % 2)
+    def keep(self, which: BoolArray | IntArray) -> _SaddleGrid:
+        return _SaddleGrid(self.cell[which], self.point[which])
 
-    def keep(self, which: BoolArray | IntArray) -> _Growing:
-        return replace(self, cell=self.cell[which], point=self.point[which])
-
-    def with_more(self, cell: IntArray, point: IntArray) -> _Growing:
-        return replace(
-            self,
-            cell=np.concatenate([self.cell, cell]),
-            point=np.concatenate([self.point, point]),
-        )
-
-    def grid(self, points: Saddles) -> Grid:
+    def grid(self, points: SaddlePoints) -> CornerGrid:
         # Light to the left of the edge that runs right from (0, 0): above it, so dark up-left.
-        return Grid(self.cell, points.uv_px[self.point], self.kind == 0)
+        return CornerGrid(self.cell, points.uv_px[self.point], True)
 
 
-def _components(points: Saddles, link: IntArray) -> Iterator[_Growing]:
-    """What hangs together by links, numbered from a first saddle each, largest first."""
+def _components(points: SaddlePoints, link: IntArray) -> Iterator[_SaddleGrid]:
+    """The sets of linked saddle points, each numbered from a first one, largest first."""
     left = set(np.flatnonzero((link >= 0).sum((1, 2)) >= 2).tolist())
     found = []
     for seed in sorted(left, key=lambda n: (-int((link[n] >= 0).sum()), n)):
@@ -115,8 +115,8 @@ def _components(points: Saddles, link: IntArray) -> Iterator[_Growing]:
     yield from sorted(found, key=lambda part: -len(part.cell))
 
 
-def _component(points: Saddles, link: IntArray, seed: int, free: set[int]) -> _Growing:
-    """Numbers a saddle's neighbours, theirs, and so on; the first number that one gets stays."""
+def _component(points: SaddlePoints, link: IntArray, seed: int, free: set[int]) -> _SaddleGrid:
+    """Numbers a saddle point's neighbours, theirs, and so on; the first number of each stays."""
     cells = {(0, 0): seed}
     right_of = {seed: (0, 0)}  # each saddle's edge to the right: type, and 1 against the edge
     at = {seed: (0, 0)}
@@ -152,10 +152,10 @@ def _component(points: Saddles, link: IntArray, seed: int, free: set[int]) -> _G
                 right_of[other] = 1 - kind, int(cross < 0)
             waiting.append(other)
     cell = np.array(list(cells), np.int64).reshape(-1, 2)
-    return _Growing(cell, np.array(list(cells.values()), np.int64), 0)
+    return _SaddleGrid(cell, np.array(list(cells.values()), np.int64))
 
 
-def _grown(grey: ImageArray, points: Saddles, start: _Growing) -> _Growing | None:
+def _grow(grey: ImageArray, points: SaddlePoints, start: _SaddleGrid) -> _SaddleGrid | None:
     """Cleaned, continued as far as the picture shows crossings, and cleaned again."""
     now = _clean(grey, points, start)
     for _ in range(_ROUNDS):
@@ -174,7 +174,7 @@ def _grown(grey: ImageArray, points: Saddles, start: _Growing) -> _Growing | Non
     return now
 
 
-def _next(grey: ImageArray, points: Saddles, now: _Growing, far: int) -> _Growing | None:
+def _next(grey: ImageArray, points: SaddlePoints, now: _SaddleGrid, far: int) -> _SaddleGrid | None:
     """With the saddles that lie `far` steps on, where the grid expects them; None without any."""
     held = {(int(c), int(r)) for c, r in now.cell}
     wanted = sorted(
@@ -182,11 +182,11 @@ def _next(grey: ImageArray, points: Saddles, now: _Growing, far: int) -> _Growin
     )
     cell = np.array(wanted, np.int64).reshape(-1, 2)
     close = (np.abs(cell[:, None] - now.cell[None]) <= _NEAR + far - 1).all(2)
-    told = close.sum(1) >= _TOLD_BY
+    known = close.sum(1) >= _KNOWN_BY
     for axis in (0, 1):  # a single row does not say where the next one lies
         place = np.where(close, now.cell[None, :, axis], 10**6)
-        told &= place.min(1) < np.where(close, now.cell[None, :, axis], -(10**6)).max(1)
-    cell = cell[told]
+        known &= place.min(1) < np.where(close, now.cell[None, :, axis], -(10**6)).max(1)
+    cell = cell[known]
     if not len(cell):
         return None
     grid = now.grid(points)
@@ -199,42 +199,46 @@ def _next(grey: ImageArray, points: Saddles, now: _Growing, far: int) -> _Growin
     point, off = free[nearest], away[np.arange(len(cell)), nearest]
     spacing = near.spacing_px
     good = off < _SNAP * spacing.min(1)
-    kind = now.kinds(cell)
+    kind = cell.sum(1) % 2
     for axis in (0, 1):
         way = near.along_px[:, :, axis] / np.maximum(spacing[:, axis, None], 1e-9)
         edge = points.edge[point, kind if axis == 0 else 1 - kind]
         good &= np.abs((edge * way).sum(1)) > _PARALLEL
     there = replace(near, at_px=points.uv_px[point])
-    good &= crossing(grey, there) * grid.sign(cell) > _CLEAN
+    good &= crossing_score(grey, there) * grid.sign(cell) > _CLEAR
     # A saddle can be one corner only: of two cells that want it, the nearer has it.
     order = np.lexsort((off, point))
     order = order[good[order]]
     order = order[np.unique(point[order], return_index=True)[1]]
-    return now.with_more(cell[order], point[order]) if len(order) else None
+    if not len(order):
+        return None
+    return _SaddleGrid(
+        np.concatenate([now.cell, cell[order]]), np.concatenate([now.point, point[order]])
+    )
 
 
-def _clean(grey: ImageArray, points: Saddles, now: _Growing) -> _Growing | None:
-    """Without what is no crossing, or not where its neighbours expect one; None if few are left."""
+def _clean(grey: ImageArray, points: SaddlePoints, now: _SaddleGrid) -> _SaddleGrid | None:
+    """Without unclear corners and those off their neighbours' prediction; None if few are left."""
     for _ in range(len(now.cell)):
         if len(now.cell) < _FEWEST or (np.ptp(now.cell, axis=0) < 1).any():
             return None
         grid = now.grid(points)
         near = replace(grid.near(now.cell), at_px=grid.uv_px)
         seen = now.cell.astype(np.float64)
-        off, _ = misfit(seen, grid.uv_px, np.ones(len(seen), np.bool_))
-        unclear = crossing(grey, near) * grid.sign(now.cell) < _CLEAN
+        off, _ = neighbour_residual(seen, grid.uv_px, np.ones(len(seen), np.bool_))
+        unclear = crossing_score(grey, near) * grid.sign(now.cell) < _CLEAR
         if unclear.any():
-            # Their neighbours' maps are spoiled by them, too: these go at once, then look again.
+            # They spoil their neighbours' maps, too: remove them at once, then check again.
             now = now.keep(~unclear)
         elif off.max() > _OFF:
             now = now.keep(np.arange(len(off)) != int(off.argmax()))
         else:
             break
-    return _together(now)
+    return _largest_part(now)
 
 
-def _together(now: _Growing) -> _Growing | None:
-    """The largest part of a grid that hangs together, over gaps of one corner as well."""
+def _largest_part(now: _SaddleGrid) -> _SaddleGrid | None:
+    """The largest connected part of a grid; gaps of one corner connect, too."""
     low = now.cell.min(0)
     at = now.cell - low
     there = np.zeros(at.max(0) + 1, np.bool_)

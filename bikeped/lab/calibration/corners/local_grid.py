@@ -1,4 +1,4 @@
-"""A found board as a grid: how pixels run with squares near each corner, and what does not fit.
+"""A board as a grid: the local map from squares to pixels, and corners that do not fit it.
 
 No lens is needed here: over two or three squares a board seen through any lens is close to a cubic.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
+from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
 _REACH = 0.8  # squares: standard deviation of a neighbour's weight
 _RIDGE = 1e-4  # keeps a cubic defined where a partial board has too few neighbours
@@ -41,19 +41,20 @@ class LocalMap:
         return np.asarray(out + square @ self.bend_px.transpose(0, 2, 1))
 
 
-def places(pattern: BoardPattern, ids: IntArray) -> FloatArray:
+def grid_positions(pattern: BoardPattern, ids: IntArray) -> FloatArray:
     """[n, 2] column and row of each id."""
     return np.stack([ids % pattern.columns, ids // pattern.columns], axis=-1).astype(np.float64)
 
 
 def local_map(
-    at: FloatArray, seen: FloatArray, uv_px: FloatArray, *, without_self: bool = False
+    at: FloatArray, position: FloatArray, uv_px: FloatArray, *, without_self: bool = False
 ) -> LocalMap:
-    """The map near places `at` [m, 2] (column, row) from corners `seen` [n, 2] at `uv_px` [n, 2].
+    """The map near places `at` [m, 2] (column, row) from corners at `position` [n, 2],
+    seen at `uv_px` [n, 2].
 
-    `without_self` leaves out a corner that lies exactly at the place: what do the others say?
+    `without_self` leaves out a corner that lies exactly at the place: it is predicted.
     """
-    step = seen[None] - at[:, None]
+    step = position[None] - at[:, None]
     far = (step**2).sum(-1)
     weight = np.exp(-far / (2 * _REACH**2)) + 1e-7
     if without_self:
@@ -74,36 +75,35 @@ def local_map(
     )
 
 
-def misfit(
-    seen: FloatArray, uv_px: FloatArray, trusted: BoolArray
+def neighbour_residual(
+    position: FloatArray, uv_px: FloatArray, trusted: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """[n] how far each corner lies from where its trusted neighbours expect it, in squares, and
     [n, 2] where that is, in pixels."""
-    expected = local_map(seen, seen[trusted], uv_px[trusted], without_self=True)
+    expected = local_map(position, position[trusted], uv_px[trusted], without_self=True)
     off = np.linalg.norm(uv_px - expected.at_px, axis=1)
     return off / np.maximum(expected.spacing_px.min(axis=1), 1e-9), expected.at_px
 
 
-def repair(
-    seen: FloatArray, uv_px: FloatArray, limit: float, most: int
-) -> tuple[FloatArray, BoolArray] | None:
-    """Moves the worst corner to where its neighbours expect it until all fit within `limit`.
+def repair_corners(
+    position: FloatArray, uv_px: FloatArray, limit: float, most: int
+) -> FloatArray | None:
+    """[n, 2] with the worst corner moved to where its neighbours expect it until all fit.
 
-    Returns corners and which were moved; None when more than `most` would have to be.
+    `limit`: of `neighbour_residual`, in squares. None when more than `most` would have to be moved.
     """
     uv = uv_px.copy()
-    moved = np.zeros(len(uv), np.bool_)
     trusted = np.ones(len(uv), np.bool_)
     for _ in range(most + 1):
-        # A wrong corner spoils its neighbours' expectation too: the worst first, then look again.
-        off, _ = misfit(seen, uv, trusted)
+        # A wrong corner spoils its neighbours' expectation too: one at a time, the worst first.
+        off, _ = neighbour_residual(position, uv, trusted)
         off[~trusted] = 0.0
         if off.max() <= limit:
-            if moved.any():
-                uv[moved] = local_map(seen[moved], seen[trusted], uv[trusted]).at_px
-            return uv, moved
-        worst = int(off.argmax())
-        trusted[worst], moved[worst] = False, True
+            if not trusted.all():
+                moved = local_map(position[~trusted], position[trusted], uv[trusted])
+                uv[~trusted] = moved.at_px
+            return uv
+        trusted[int(off.argmax())] = False
     return None
 
 
@@ -115,16 +115,23 @@ def quadrants(grey: ImageArray, near: LocalMap, share: float = 0.3) -> FloatArra
 
 
 def sample(grey: ImageArray, uv_px: FloatArray) -> FloatArray:
-    """Grey level of the nearest pixel [...] to `uv_px` [..., 2]; NaN outside the picture."""
+    """Grey level [...] of the nearest pixel to `uv_px` [..., 2]; NaN outside the image."""
     u, v = np.rint(uv_px[..., 0]), np.rint(uv_px[..., 1])
     inside = (u >= 0) & (v >= 0) & (u < grey.shape[1]) & (v < grey.shape[0])
-    column = np.where(inside, u, 0).astype(np.intp)
-    row = np.where(inside, v, 0).astype(np.intp)
-    return np.asarray(np.where(inside, grey[row, column].astype(np.float64), np.nan))
+    level = nearest_level(grey, np.where(inside[..., None], uv_px, 0))
+    return np.asarray(np.where(inside, level, np.nan))
 
 
-def crossing(grey: ImageArray, near: LocalMap) -> FloatArray:
-    """[n] how much each place looks like a corner: 1 for a clean crossing, 0 or less for none.
+def nearest_level(grey: ImageArray | Float32Array, uv_px: FloatArray) -> FloatArray:
+    """Grey level [...] of the image's pixel nearest to `uv_px` [..., 2], at its edge outside."""
+    at = np.rint(uv_px).astype(np.intp)
+    u = np.clip(at[..., 0], 0, grey.shape[1] - 1)
+    v = np.clip(at[..., 1], 0, grey.shape[0] - 1)
+    return np.asarray(grey[v, u].astype(np.float64))
+
+
+def crossing_score(grey: ImageArray, near: LocalMap) -> FloatArray:
+    """[n] how clearly each place is a corner: 1 for a clean crossing, 0 for none.
 
     The smallest difference between a dark and a light quadrant, over the largest; the sign is that
     of the colours: positive where the square up-left of the corner is dark.

@@ -1,93 +1,86 @@
-"""Boards of which a part is hidden: their corners get ids only where the pattern pins them.
+"""Partly hidden boards: corner ids only where the pattern leaves one place for the visible part.
 
-A grid that was grown from what can be seen counts from anywhere. Its place on the board is known
-when it has all columns and all rows, or where the squares of an outer edge are followed by the
-paper's white margin. Else the picture is refused, with the reason: which corner is which would be a
-guess.
+A grid grown from the visible corners counts from anywhere. Its place on the board is known when it
+has all columns and all rows, or where the squares of an outer edge are followed by the paper's
+white margin. Any other image is refused, with the reason: the ids would be a guess.
 """
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from bikeped.lab.calibration import refusals
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.corners.board_check import Checked, good_corners, settled
-from bikeped.lab.calibration.corners.corner_ids import pin
-from bikeped.lab.calibration.corners.detect_raw import FIRST_SIDE_PX
-from bikeped.lab.calibration.corners.grid_growing import Grid, grids
+from bikeped.lab.calibration.corners.board_check import (
+    DetectedBoard,
+    good_corners,
+    refine_by_gradient,
+)
+from bikeped.lab.calibration.corners.candidates import LARGEST_SIDE_PX, first_scale, resized
+from bikeped.lab.calibration.corners.corner_ids import assign_corner_ids
+from bikeped.lab.calibration.corners.corner_refinement import refine_corners
+from bikeped.lab.calibration.corners.grid_growing import CornerGrid, find_grids
 from bikeped.lab.calibration.corners.local_grid import local_map
-from bikeped.lab.calibration.corners.refine import refine
+from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
 
-_SCALES = (1.0, 2.0, 0.5)  # of a picture made FIRST_SIDE_PX large; no more than _LARGEST_PX
-_LARGEST_PX = 2300
+_SCALES = (1.0, 2.0, 0.5)  # relative to the scale at which an image is searched first
 #: Of the board's corners: with fewer, chance could make the outer lines, and little is gained.
 LEAST_SHARE = 0.5
-_BOARD_SHARE = 1 / 3  # of the corners: in sight, and worth a word on what is missing
-_STRANGE_TIMES, _STRANGE = 3.0, 0.1  # what a refined corner may leave: times the usual, at least
+_BOARD_SHARE = 1 / 3  # of the corners: fewer are no board, and need no reason
+_STRANGE_TIMES, _STRANGE = 3.0, 0.1  # residual of a refined corner: times the usual, at least
 _BESIDE_TIMES, _BESIDE = 1.7, 0.015  # the same beside a hidden one
 _USUAL = 0.25  # quantile: more than half of the corners may be disturbed
 _PASSES = 3
 
 
-def partial_board(grey: ImageArray, pattern: BoardPattern) -> Checked | str:
-    """The corners of a board that is partly in sight; or why its ids cannot be known, in words.
+def partial_board(grey: ImageArray, pattern: BoardPattern) -> DetectedBoard:
+    """The corners of a board that is partly visible; BoardRefusedError where ids are not known.
 
-    The words are empty where nothing in the picture looks like a board.
+    The reason is the largest grid's, empty where nothing in the image looks like a board.
     """
-    why, most = "", 0
-    first = min(1.0, FIRST_SIDE_PX / max(grey.shape))
+    reason, most = "", 0
+    first = first_scale(grey)
     for scale in (first * scale for scale in _SCALES):
-        if scale > first and max(grey.shape) * scale > _LARGEST_PX:
+        if scale > first and max(grey.shape) * scale > LARGEST_SIDE_PX:
             continue
-        for grid in _at_scale(grey, scale):
-            answer = placed(grey, pattern, grid)
-            if isinstance(answer, Checked):
-                return answer
-            if answer and len(grid) > most:
-                why, most = answer, len(grid)
-    return why
+        small, to_full = resized(grey, scale)
+        for grid in find_grids(small):
+            try:
+                return number_grid(
+                    grey, pattern, CornerGrid(grid.cell, to_full(grid.uv_px), grid.dark)
+                )
+            except BoardRefusedError as refused:  # noqa: PERF203  (a grid takes far longer)
+                if refused.reason and len(grid) > most:
+                    reason, most = refused.reason, len(grid)
+    raise BoardRefusedError(reason)
 
 
-def _at_scale(grey: ImageArray, scale: float) -> list[Grid]:
-    """The picture's grids as seen `scale` times as large, in pixels of the full picture."""
-    size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
-    if size == (grey.shape[1], grey.shape[0]):
-        return grids(grey)
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    small = np.asarray(cv2.resize(grey, size, interpolation=how), np.uint8)
-    ratio = np.array([grey.shape[1] / size[0], grey.shape[0] / size[1]])
-    return [Grid(one.cell, (one.uv_px + 0.5) * ratio - 0.5, one.dark) for one in grids(small)]
-
-
-def placed(grey: ImageArray, pattern: BoardPattern, grid: Grid) -> Checked | str:
-    """A grown grid refined and numbered; or why it cannot be, in words (none for a mere scrap)."""
-    if len(grid) < _BOARD_SHARE * pattern.count:
-        return ""
-    seen = grid.cell.astype(np.float64)
-    uv = settled(grey, grid.near(grid.cell), grid.uv_px)
+def number_grid(grey: ImageArray, pattern: BoardPattern, grid: CornerGrid) -> DetectedBoard:
+    """A grown grid refined and numbered; BoardRefusedError, without a reason for a mere scrap."""
+    fewest = _BOARD_SHARE * pattern.count
+    if len(grid) < fewest:
+        raise BoardRefusedError("")
+    position = grid.cell.astype(np.float64)
+    uv = refine_by_gradient(grey, grid.near(grid.cell), grid.uv_px)
     beside = _beside_hidden(grid.cell)
     for _ in range(_PASSES):
-        refined = refine(grey, seen, uv)
-        good, _ = good_corners(grey, seen, refined)
+        refined = refine_corners(grey, position, uv)
+        good, _ = good_corners(grey, position, refined)
         good &= _undisturbed(refined.residual, beside)
-        seen, uv, beside = seen[good], refined.uv_px[good], beside[good]
-        if good.all() or len(seen) < _BOARD_SHARE * pattern.count:
+        position, uv, beside = position[good], refined.uv_px[good], beside[good]
+        if good.all() or len(position) < fewest:
             break
-    if len(seen) < _BOARD_SHARE * pattern.count:
-        return ""
-    found = Grid(seen.astype(np.int64), uv, grid.dark)
-    ids = pin(grey, pattern, found)
-    if isinstance(ids, str):
-        return ids
+    if len(position) < fewest:
+        raise BoardRefusedError("")
+    ids = assign_corner_ids(grey, pattern, CornerGrid(position.astype(np.int64), uv, grid.dark))
     least = int(np.ceil(LEAST_SHARE * pattern.count))
     if len(ids) < least:
-        return f"only {len(ids)} of {pattern.count} corners can be seen clearly, not {least}"
-    spacing = local_map(seen, seen, uv).spacing_px.min(1)
+        raise BoardRefusedError(refusals.too_few_corners(len(ids), pattern, least))
+    spacing = local_map(position, position, uv).spacing_px.min(1)
     order = np.argsort(ids)
     blur = float(np.median(refined.blur_px[good]))
-    return Checked(ids[order], uv[order], blur, float(np.median(spacing)))
+    return DetectedBoard(ids[order], uv[order], blur, float(np.median(spacing)))
 
 
 def _beside_hidden(cell: IntArray) -> BoolArray:
@@ -105,10 +98,10 @@ def _beside_hidden(cell: IntArray) -> BoolArray:
 
 
 def _undisturbed(residual: FloatArray, beside: BoolArray) -> BoolArray:
-    """[n] which corners the edge of what hides the others does not touch.
+    """[n] which corners are not moved by the edge of an occluding object.
 
-    Where it runs along an edge of the board it moves a corner by half a pixel and leaves little
-    that the model cannot explain: a corner with a hidden neighbour has to fit as the usual ones do.
+    Where that edge runs along an edge of the board it moves a corner by half a pixel and leaves
+    little residual, so a corner with a hidden neighbour has to fit as well as the usual ones.
     """
     usual = float(np.quantile(residual, _USUAL))
     most = np.where(

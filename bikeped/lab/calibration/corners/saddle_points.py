@@ -1,8 +1,8 @@
-"""Crossings of two edges anywhere in a picture, each by itself: what a partial board is grown from.
+"""Saddle points of the brightness, from which grids of a partly hidden board are grown.
 
-Where four squares meet, the smoothed brightness is a saddle. Its curvature says where the two edges
-run, through any lens, and which squares are the light ones. Neighbours on a board share an edge:
-light lies on the same side of it all the way from one to the other.
+Where four squares meet, the smoothed brightness has a saddle point. Its curvature gives the
+directions of the two edges, through any lens, and which squares are light. Neighbours on a board
+share an edge: light lies on the same side of it all the way from one to the other.
 """
 
 from __future__ import annotations
@@ -13,29 +13,30 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from bikeped.lab.calibration.corners.local_grid import nearest_level
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
 _SMOOTH_PX = 1.5
-_PICTURE_BLUR_PX = 0.7  # what a sharp picture has; for the contrast only
+_IMAGE_BLUR_PX = 0.7  # of a sharp image; for the contrast only
 _LEAST_CONTRAST = 12.0  # grey levels
-_MOST = 2500  # of the strongest: a busy picture has thousands
+_MOST = 2500  # of the strongest: a cluttered image has thousands
 _PEAK_PX = 5  # side of the window in which a saddle is the strongest
 _OFF_PX = 1.5  # from the strongest pixel to the saddle itself
-_ROUND_PX = 3.0  # where the four squares about a saddle are looked at, ...
+_ROUND_PX = 3.0  # where the four squares about a saddle point are sampled, ...
 _ROUND_SHARE = 0.3  # ... and of the contrast, what light and dark ones must differ by
-_NEIGHBOURS = 32  # looked at round each
+_NEIGHBOURS = 32  # examined around each
 _ALIGNED = np.cos(np.radians(22.0))  # a link and the edges at both ends
-_ALONG = np.array([0.25, 0.4, 0.6, 0.75])  # where an edge is looked at
+_ALONG = np.array([0.25, 0.4, 0.6, 0.75])  # where an edge is sampled
 _ACROSS = 0.15  # to either side of it, as a share of its length
 _EDGE_SHARE = 0.25  # of the contrast that an edge must keep everywhere
 
 
 @dataclass(frozen=True)
-class Saddles:
+class SaddlePoints:
     """Crossings `uv_px` [n, 2], `contrast` [n] grey levels, `edge` [n, 2 (type), 2] unit vectors.
 
     Smoothing makes right angles of slanting crossings, so edges are off by half of the difference.
-    Looking along an edge of type 0, to either end, light lies to the left as the picture is seen
+    Looking along an edge of type 0, to either end, light lies to the left in the image
     (u right, v down); of type 1, to the right.
     """
 
@@ -47,8 +48,8 @@ class Saddles:
         return len(self.uv_px)
 
 
-def saddles(grey: ImageArray) -> Saddles:
-    """The strongest crossings of a picture [height, width]: true ones, and what looks like them."""
+def find_saddle_points(grey: ImageArray) -> SaddlePoints:
+    """The strongest saddle points of an image [height, width]: corners, and similar structures."""
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SMOOTH_PX)
     one, slope, bend = (np.array(k, np.float32) for k in ([1], [-0.5, 0, 0.5], [1, -2, 1]))
     part = [
@@ -58,7 +59,7 @@ def saddles(grey: ImageArray) -> Saddles:
     depth = np.asarray(part[3] * part[3] - part[2] * part[4])
     peak = depth >= cv2.dilate(depth, np.ones((_PEAK_PX, _PEAK_PX), np.uint8))
     # A crossing of contrast C, smoothed by s, has the mixed derivative C / (pi s^2).
-    unit = np.pi * (_SMOOTH_PX**2 + _PICTURE_BLUR_PX**2)
+    unit = np.pi * (_SMOOTH_PX**2 + _IMAGE_BLUR_PX**2)
     peak &= depth > (_LEAST_CONTRAST / unit) ** 2
     row, column = np.nonzero(peak)
     gu, gv, uu, uv, vv = (np.asarray(p[row, column], np.float64) for p in part)
@@ -76,7 +77,7 @@ def saddles(grey: ImageArray) -> Saddles:
     ]
     which = which[np.argsort(-deep[which], kind="stable")[:_MOST]]
     edge = _edges(uu[which], uv[which], vv[which])
-    return Saddles(at[which], contrast[which], edge)
+    return SaddlePoints(at[which], contrast[which], edge)
 
 
 def _four_squares(
@@ -85,7 +86,7 @@ def _four_squares(
     """[n] where both light squares are lighter than both dark ones: no mere corner of a square."""
     angle = light[:, None] + np.arange(4) * np.pi / 2
     around = at[:, None] + _ROUND_PX * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    level = _level(smooth, around)
+    level = nearest_level(smooth, around)
     least = level[:, [0, 2]].min(1) - level[:, [1, 3]].max(1)
     return np.asarray(least > _ROUND_SHARE * contrast)
 
@@ -100,7 +101,7 @@ def _edges(uu: FloatArray, uv: FloatArray, vv: FloatArray) -> FloatArray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def links(grey: ImageArray, points: Saddles) -> IntArray:
+def link_neighbours(grey: ImageArray, points: SaddlePoints) -> IntArray:
     """[n, 2 (type), 2 (along the edge, against it)] each saddle's neighbour; -1 where none.
 
     The nearest along the edge whose own edge runs on and turns its colours, with the edge visible
@@ -129,22 +130,15 @@ def links(grey: ImageArray, points: Saddles) -> IntArray:
 
 
 def _visible(
-    grey: ImageArray, points: Saddles, a: IntArray, b: IntArray, *, light_left: bool
+    grey: ImageArray, points: SaddlePoints, a: IntArray, b: IntArray, *, light_left: bool
 ) -> IntArray:
     """Which of the links from `a` to `b` follow an edge that is light on one side throughout."""
     step = points.uv_px[b] - points.uv_px[a]
     left = np.stack([step[:, 1], -step[:, 0]], axis=-1) * (_ACROSS if light_left else -_ACROSS)
     on = points.uv_px[a][:, None] + _ALONG[:, None] * step[:, None]
-    level = [_level(grey, on + side * left[:, None]) for side in (1, -1)]
+    level = [nearest_level(grey, on + side * left[:, None]) for side in (1, -1)]
     contrast = np.minimum(points.contrast[a], points.contrast[b])
     return np.flatnonzero((level[0] - level[1] > _EDGE_SHARE * contrast[:, None]).all(1))
-
-
-def _level(grey: ImageArray | Float32Array, uv_px: FloatArray) -> FloatArray:
-    at = np.rint(uv_px).astype(np.intp)
-    u = np.clip(at[..., 0], 0, grey.shape[1] - 1)
-    v = np.clip(at[..., 1], 0, grey.shape[0] - 1)
-    return np.asarray(grey[v, u].astype(np.float64))
 
 
 def _mutual(found: IntArray) -> IntArray:

@@ -1,19 +1,21 @@
-"""The figures of the calibration report, each as the bytes of a PNG."""
+"""The figures of the calibration report, each a PNG."""
 
 from __future__ import annotations
 
 import io
 import itertools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bikeped.geometry.lens import LIMITS, unit_radius
-from bikeped.lab.calibration.report.calibration_file import Field
-from bikeped.lab.calibration.solver.compare import Calibrated
+from bikeped.lab.calibration.capture.coverage import CircleSector
+from bikeped.lab.calibration.report.field_of_view import FieldOfView
 from bikeped.lab.calibration.solver.initial_guess import FISHEYE
-from bikeped.lab.calibration.solver.lens_fit import Fit
+from bikeped.lab.calibration.solver.lens_fit import LensFit
 from bikeped.lab.calibration.solver.lens_model import angles, camera_points
+from bikeped.lab.calibration.solver.model_comparison import ModelComparison
 from bikeped.lab.plotting import BLACK, BLUE, GREY, LIGHT, RED, SERIES, FigureSheet
 from bikeped.types import FloatArray
 
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _BIN_DEG = 10.0
-_RASTER = True
 
 
 def png(sheet: FigureSheet) -> bytes:
@@ -31,14 +32,14 @@ def png(sheet: FigureSheet) -> bytes:
     return data.getvalue()
 
 
-def comparison_figure(calibrated: Calibrated, chosen: str) -> bytes:
+def comparison_figure(comparison: ModelComparison, chosen: str) -> bytes:
     """RMS and cross-validated error of every model, least last."""
-    fits = sorted(calibrated.fits.values(), key=lambda f: f.cross_validated_px or f.rms_px)[::-1]
+    fits = comparison.ranked[::-1]
     rows = np.arange(len(fits))
     with FigureSheet(
         "Error of each model on the same corners",
         "Per point, sqrt(mean(dx² + dy²)), on a logarithmic scale. Cross-validated: on pictures "
-        f"that did not help to fit the lens ({calibrated.folds} folds). Bold: the model written.",
+        f"that did not help to fit the lens ({comparison.folds} folds). Bold: the model written.",
         width=7.0,
         height=0.9 + 0.26 * len(fits),
     ) as sheet:
@@ -53,7 +54,7 @@ def comparison_figure(calibrated: Calibrated, chosen: str) -> bytes:
         for row, f in zip(rows, fits, strict=True):
             at = max(f.rms_px, f.cross_validated_px or 0.0)
             axes.annotate(
-                f"{f.cross_validated_px or f.rms_px:.3f}",
+                f"{f.ranking_px:.3f}",
                 (at, float(row)),
                 xytext=(7, 0),
                 textcoords="offset points",
@@ -82,13 +83,13 @@ def _plain_log(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def radial_residuals(fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
+def radial_residuals(fit: LensFit) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Angle (degrees), and residual along and across the radius (px), of every seen corner.
 
     Seen minus projected: positive along means that the corner lies farther out than the lens says.
     """
-    seen = fit.sightings.seen
-    offset = fit.sightings.uv_px[seen] - fit.state.lens[:2]
+    seen = fit.observations.visible
+    offset = fit.observations.uv_px[seen] - fit.state.lens[:2]
     outward = offset / np.maximum(np.hypot(*offset.T), 1e-9)[:, None]
     error = -fit.residuals_px[seen]
     along = (error * outward).sum(1)
@@ -96,7 +97,7 @@ def radial_residuals(fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.degrees(fit.angles_rad[seen]), along, across
 
 
-def angle_figure(fit: Fit, field: Field) -> bytes:
+def angle_figure(fit: LensFit, field: FieldOfView) -> bytes:
     """Residuals against the angle from the axis."""
     theta, along, across = radial_residuals(fit)
     edges = np.arange(0, np.degrees(field.half_rad) + _BIN_DEG, _BIN_DEG)
@@ -115,7 +116,7 @@ def angle_figure(fit: Fit, field: Field) -> bytes:
         for axes, values, what in zip(
             sheet.axes, (along, across), ("along the radius", "across it"), strict=True
         ):
-            axes.plot(theta, values, ".", ms=2.5, color=GREY, alpha=0.55, rasterized=_RASTER)
+            axes.plot(theta, values, ".", ms=2.5, color=GREY, alpha=0.55, rasterized=True)
             middles, means, spreads = [], [], []
             for low, high in itertools.pairwise(edges):
                 inside = values[(theta >= low) & (theta < high)]
@@ -135,11 +136,11 @@ def angle_figure(fit: Fit, field: Field) -> bytes:
         return png(sheet)
 
 
-def profile_figure(fit: Fit, field: Field) -> bytes:
+def profile_figure(fit: LensFit, field: FieldOfView) -> bytes:
     """r(theta), and its difference from the four ideal lenses of the same slope on the axis."""
     theta: FloatArray = np.linspace(0.0, field.half_rad, 400, dtype=np.float64)
     degrees = np.degrees(theta)
-    own = fit.radius(theta)
+    own = fit.state.radius_px(theta)
     with FigureSheet(
         "The lens's profile",
         "Left: image radius against the angle from the axis. Right: how far the four ideal "
@@ -181,12 +182,12 @@ def profile_figure(fit: Fit, field: Field) -> bytes:
         return png(sheet)
 
 
-def board_figure(fit: Fit) -> bytes:
+def board_figure(fit: LensFit) -> bytes:
     """The board's fitted shape: out of the plane as colours, in the plane as arrows."""
-    pattern = fit.sightings.pattern
-    flat, shape = fit.sightings.flat, fit.state.shape * 100
+    pattern = fit.observations.pattern
+    flat, shape = fit.observations.flat, fit.state.shape * 100
     # Counted as in a mirror, the board's z axis looks at the camera.
-    facing = (fit.state.turn[:, :, 2] * fit.state.move).sum(-1)
+    facing = (fit.state.rotation[:, :, 2] * fit.state.translation).sum(-1)
     height = np.sign(np.median(facing)) * shape[:, 2].reshape(pattern.rows, pattern.columns)
     bound = max(float(np.abs(height).max()), 0.1)
     with FigureSheet(
@@ -224,9 +225,9 @@ def board_figure(fit: Fit) -> bytes:
         return png(sheet)
 
 
-def coverage_figure(fit: Fit, field: Field, gaps: FloatArray | None = None) -> bytes:
-    """Where in the image circle corners were seen, by direction: angle from the axis as radius."""
-    points = camera_points(fit.state, fit.sightings.flat)[fit.sightings.seen]
+def coverage_figure(fit: LensFit, field: FieldOfView, gaps: Sequence[CircleSector] = ()) -> bytes:
+    """All corners by their direction in the lens: the angle from the axis as radius."""
+    points = camera_points(fit.state, fit.observations.flat)[fit.observations.visible]
     theta, phi = np.degrees(angles(points)), np.arctan2(points[:, 1], points[:, 0])
     half = float(np.degrees(field.half_rad))
     with FigureSheet(
@@ -239,19 +240,18 @@ def coverage_figure(fit: Fit, field: Field, gaps: FloatArray | None = None) -> b
         subplot_kw={"projection": "polar"},
     ) as sheet:
         axes = sheet.axes[0]
-        if gaps is not None:
-            for low, high, start, stop in gaps:
-                axes.bar(
-                    (start + stop) / 2,
-                    np.degrees(high - low),
-                    width=stop - start,
-                    bottom=np.degrees(low),
-                    color="#f6e3c9",
-                    edgecolor="#d08a2e",
-                    hatch="///",
-                    lw=0.6,
-                )
-        axes.plot(phi, theta, ".", ms=3, color=BLUE, alpha=0.6, rasterized=_RASTER)
+        for gap in gaps:
+            axes.bar(
+                (gap.start_rad + gap.stop_rad) / 2,
+                np.degrees(gap.to_rad - gap.from_rad),
+                width=gap.stop_rad - gap.start_rad,
+                bottom=np.degrees(gap.from_rad),
+                color="#f6e3c9",
+                edgecolor="#d08a2e",
+                hatch="///",
+                lw=0.6,
+            )
+        axes.plot(phi, theta, ".", ms=3, color=BLUE, alpha=0.6, rasterized=True)
         axes.set_theta_direction(-1)  # type: ignore[attr-defined]
         axes.set_rlim(0, half)  # type: ignore[attr-defined]
         axes.set_rlabel_position(45)  # type: ignore[attr-defined]

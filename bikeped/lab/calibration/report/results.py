@@ -1,57 +1,76 @@
-"""What a calibration says, as data: the JSON of `bikeped calibrate`, and words of caution."""
+"""The result of a calibration: the JSON of `bikeped calibrate`, and cautions."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.lab.calibration.report.calibration_file import ENDS_SLOW, ENDS_VAGUE, Field, known
-from bikeped.lab.calibration.solver.compare import Calibrated, Recommendation
-from bikeped.lab.calibration.solver.lens_fit import Fit, rms_by_picture
+from bikeped.geometry import Framing
+from bikeped.lab.calibration.capture.coverage import Coverage
+from bikeped.lab.calibration.report.calibration_file import finite_or_null
+from bikeped.lab.calibration.report.field_of_view import ENDS_SLOW, ENDS_VAGUE, FieldOfView
+from bikeped.lab.calibration.solver.lens_fit import LensFit, rms_by_image
+from bikeped.lab.calibration.solver.model_comparison import ModelComparison, Recommendation
+from bikeped.lab.calibration.solver.observations import PreparedObservations
 
-#: Fewer boards than this leave a lens to chance; the paper used 42.
+#: Fewer boards than this do not cover a lens; the paper used 42.
 _FEW_BOARDS = 10
 #: Corners should reach this share of the field of view.
 _REACH_SHARE = 0.85
 
 
-def result_data(
-    calibrated: Calibrated, chosen: Fit, recommendation: Recommendation, cautions: list[str]
-) -> dict[str, Any]:
-    """The keys that `interfaces` fixes, and more beside them. Errors in pixels."""
-    prepared = calibrated.prepared
-    sightings = prepared.sightings
-    plain = calibrated.one_parameter
+@dataclass(frozen=True)
+class CalibrationResult:
+    """All fits, the one that is written, and what to know about it."""
+
+    comparison: ModelComparison
+    chosen: LensFit
+    recommendation: Recommendation
+    field: FieldOfView
+    coverage: Coverage
+    cautions: Sequence[str]
+    framing: Framing | None = None  #: of sensor frames; None: the images are used as they are
+
+
+def result_data(result: CalibrationResult) -> dict[str, Any]:
+    """The JSON of `bikeped calibrate`; its keys are fixed. Errors in pixels."""
+    comparison, recommendation = result.comparison, result.recommendation
+    prepared = comparison.prepared
+    observations = prepared.observations
+    plain = comparison.one_parameter
     return {
-        "boards_total": prepared.boards_total,
-        "boards_used": len(sightings),
-        "refused": [{"file": Path(r.name).name, "why": r.why} for r in calibrated.refused],
-        "corners": int(sightings.seen.sum()),
-        "corners_of_a_board": sightings.pattern.count,
+        "boards_total": prepared.images,
+        "boards_used": len(observations),
+        "refused": [{"file": Path(r.file).name, "why": r.reason} for r in prepared.refused],
+        "corners": int(observations.visible.sum()),
+        "corners_of_a_board": observations.pattern.count,
         "corners_by_picture": {
             Path(name).name: int(count)
-            for name, count in zip(sightings.names, sightings.seen.sum(1), strict=True)
+            for name, count in zip(observations.names, observations.visible.sum(1), strict=True)
         },
         "corners_left_out": [
-            {"file": Path(c.name).name, "corner": c.corner, "off_px": round(c.off_px, 3)}
-            for c in calibrated.left_out
+            {"file": Path(c.file).name, "corner": c.corner, "off_px": round(c.off_px, 3)}
+            for c in prepared.outliers
         ],
         "best_one_parameter_model": next(iter(plain)) if len(plain) > 1 else None,
         "recommended": recommendation.name,
-        "recommended_why": recommendation.why,
-        "chosen": chosen.name,
-        "folds": calibrated.folds,
-        "cautions": cautions,
-        "pictures_hash": prepared.pictures_hash,
-        "fits": {name: fit_data(fit) for name, fit in calibrated.fits.items()},
+        "recommended_why": recommendation.reason,
+        "chosen": result.chosen.name,
+        "folds": comparison.folds,
+        "cautions": list(result.cautions),
+        "pictures_hash": prepared.images_hash,
+        "fits": {name: _fit_data(fit) for name, fit in comparison.fits.items()},
+        "coverage": {"share": result.coverage.share, "next": result.coverage.advice()},
     }
 
 
-def fit_data(fit: Fit) -> dict[str, Any]:
-    """One model: errors, parameters with their uncertainty, how the adjustment went."""
+def _fit_data(fit: LensFit) -> dict[str, Any]:
+    """One model: errors, parameters with their uncertainty, the stages of the adjustment."""
     k = fit.state.terms[: fit.model.terms]
-    by_picture = rms_by_picture(fit.residuals_px, fit.sightings)
+    by_image = rms_by_image(fit.residuals_px, fit.observations)
     return {
         "rms_px": fit.rms_px,
         "rms_per_coordinate_px": fit.rms_per_coordinate_px,
@@ -63,11 +82,11 @@ def fit_data(fit: Fit) -> dict[str, Any]:
         "cy": fit.cy,
         "f": fit.focal_px,
         **{f"k{n + 1}": value for n, value in enumerate(k)},
-        "uncertainty": known(fit.uncertainty),
+        "uncertainty": finite_or_null(fit.uncertainty),
         "measured_to_deg": math.degrees(fit.measured_to_rad),
         "rms_by_picture_px": {
             Path(name).name: float(error)
-            for name, error in zip(fit.sightings.names, by_picture, strict=True)
+            for name, error in zip(fit.observations.names, by_image, strict=True)
         },
         "stages": [
             {
@@ -84,13 +103,15 @@ def fit_data(fit: Fit) -> dict[str, Any]:
     }
 
 
-def cautions_of(calibrated: Calibrated, fit: Fit, field: Field) -> list[str]:
-    """What a person should know before trusting the fit; empty when all is well."""
+def calibration_cautions(
+    prepared: PreparedObservations, fit: LensFit, field: FieldOfView
+) -> list[str]:
+    """Warnings about the fit, one sentence each; empty where there is none."""
     out = []
-    sightings = fit.sightings
-    if len(sightings) < _FEW_BOARDS:
+    observations = fit.observations
+    if len(observations) < _FEW_BOARDS:
         out.append(
-            f"only {len(sightings)} boards: photograph 15 or more, tilted, all over the picture"
+            f"only {len(observations)} boards: photograph 15 or more, tilted, all over the picture"
         )
     reach, half = math.degrees(fit.measured_to_rad), math.degrees(field.half_rad)
     if reach < _REACH_SHARE * half:
@@ -100,10 +121,10 @@ def cautions_of(calibrated: Calibrated, fit: Fit, field: Field) -> list[str]:
         )
     if field.ends_at in (ENDS_SLOW, ENDS_VAGUE):
         out.append(f"the field of view ends at {half:.0f} degrees from the axis, {field.ends_at}")
-    if calibrated.left_out:
-        files = len({c.name for c in calibrated.left_out})
+    if prepared.outliers:
+        files = len({c.file for c in prepared.outliers})
         out.append(
-            f"{len(calibrated.left_out)} corners in {files} pictures are off by more than noise "
+            f"{len(prepared.outliers)} corners in {files} pictures are off by more than noise "
             "explains and were left out"
         )
     error = fit.cross_validated_px

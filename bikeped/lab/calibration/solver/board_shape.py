@@ -1,12 +1,12 @@
-"""The board as it is, not as it was meant: offsets of its corners, shared by all pictures.
+"""The board's real shape: offsets of its corners from a flat, even board, shared by all images.
 
 Printed boards bend by about 1 % of a square, and paper stretches; on real sets this is the largest
-part of what the lens model cannot explain. Offsets that a pose or the square's size could stand for
-are taken out (the gauge): out of the plane the mean and both tilts, in the plane both shifts, the
-turn and the scale. The rest carries a weak prior, so that corners that few pictures show stay put.
+error that the lens model cannot explain. Offsets equal to a change of pose or scale are removed
+(the gauge): out of the plane the mean and both tilts, in the plane both shifts, the rotation and
+the scale. The rest has a weak prior, which holds corners that few images show.
 
-A board of, say, 8 x 6 corners looks the same turned by half a turn, so pictures may count its
-corners from either end. The flat board cannot tell; the bent one can: `alignment` renumbers.
+A board of, say, 8 x 6 corners looks the same turned by half a turn, so images may number its
+corners from either end. Only the bend tells them apart: `align_numbering` renumbers.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.solver.jacobian import jacobian
-from bikeped.lab.calibration.solver.lens_model import Sightings, State
-from bikeped.types import BoolArray, FloatArray, IntArray
+from bikeped.lab.calibration.solver.lens_model import CalibrationState, CornerObservations
+from bikeped.types import FloatArray, IntArray
 
 #: Prior standard deviations in squares, out of the plane and in it: bends reach some percent of a
 #: square, printing is ten times better.
@@ -28,14 +28,14 @@ _STARTS, _ROUNDS = 6, 8
 
 
 def gauge_basis(flat: FloatArray) -> FloatArray:
-    """[3C, 3C - 7] orthonormal offsets of a `flat` [C, 3] board that no pose or scale makes.
+    """[3C, 3C - 7] orthonormal offsets of a `flat` [C, 3] board, without pose and scale changes.
 
     Rows are corner by corner x, y, z. In squares.
     """
     return _basis(flat.tobytes())
 
 
-@functools.lru_cache(maxsize=8)  # every fit of a set asks for the same one
+@functools.lru_cache(maxsize=8)  # every fit of a set uses the same one
 def _basis(flat_bytes: bytes) -> FloatArray:
     flat = np.frombuffer(flat_bytes).reshape(-1, 3)
     count = len(flat)
@@ -61,94 +61,98 @@ def prior_weights(count: int) -> FloatArray:
     return np.tile([PRIOR_IN**-2, PRIOR_IN**-2, PRIOR_OUT**-2], count)
 
 
-def turns_of(pattern: BoardPattern) -> IntArray:
-    """[n, C] the ways to count the corners that a turn of the board about its middle allows.
+def board_symmetries(pattern: BoardPattern) -> IntArray:
+    """[n, C] the numberings of the corners under the board's rotational symmetries.
 
-    Two for a board, four for a square one: row k holds, for each number, which corner of the first
-    way takes it. Mirrored ways are no turn.
+    Two for a board, four for a square one: row k holds, for each id, which corner of the first
+    numbering gets it. Mirrored numberings are not among them.
     """
     ids = np.arange(pattern.count).reshape(pattern.rows, pattern.columns)
     steps = range(4) if pattern.rows == pattern.columns else (0, 2)
     return np.stack([np.rot90(ids, step).ravel() for step in steps])
 
 
-def mirrored(pattern: BoardPattern) -> IntArray:
-    """[C] the numbering seen in a mirror: columns counted backwards."""
+def mirrored_numbering(pattern: BoardPattern) -> IntArray:
+    """[C] the mirrored numbering: columns counted backwards."""
     ids = np.arange(pattern.count).reshape(pattern.rows, pattern.columns)
     return ids[:, ::-1].ravel()
 
 
-def way_turns(flat: FloatArray, ways: IntArray) -> FloatArray:
-    """[n, 3, 3] the turns of the board that go with `turns_of`: flat[way[c]] = turn flat[c]."""
-    out = np.zeros((len(ways), 3, 3))
+def symmetry_rotations(flat: FloatArray, numberings: IntArray) -> FloatArray:
+    """[n, 3, 3] rotations of the board for `numberings` [n, C]: flat[numbering[c]] = R flat[c]."""
+    out = np.zeros((len(numberings), 3, 3))
     out[:, 2, 2] = 1
-    for number, way in enumerate(ways):
-        left, _, right = np.linalg.svd(flat[way][:, :2].T @ flat[:, :2])
+    for number, numbering in enumerate(numberings):
+        left, _, right = np.linalg.svd(flat[numbering][:, :2].T @ flat[:, :2])
         out[number, :2, :2] = left @ right
     return out
 
 
-def alignment(state: State, sightings: Sightings, sigma_px: float) -> tuple[IntArray, State]:
-    """Which way each picture counts the corners: [V, C] for `Sightings.renumbered`, and the state
-    with the poses that go with it.
+def align_numbering(
+    state: CalibrationState, observations: CornerObservations, sigma_px: float
+) -> tuple[IntArray, CalibrationState]:
+    """[V, C] the common numbering for `CornerObservations.renumbered`, and the state for it.
 
-    A picture counted as in a mirror is turned first: its board faces the other way than most. Then
-    shape and ways are found in turn: the shape that the pictures agree on, and for every picture
-    the way that fits this shape best; begun from several pictures, the best kept.
+    Images with a mirrored numbering are turned first: their board faces the other way than most.
+    Then shape and numberings are found alternately: the shape that the images agree on, and for
+    every image the numbering that fits it best; from several starting images, the best is kept.
     """
-    pattern = sightings.pattern
-    ways = turns_of(pattern)
-    away = (state.turn[:, :, 2] * state.move).sum(-1) < 0
+    pattern, count = observations.pattern, len(observations)
+    numberings = board_symmetries(pattern)
+    away = (state.rotation[:, :, 2] * state.translation).sum(-1) < 0
     odd = away if away.mean() <= 0.5 else ~away
-    handed = np.where(odd[:, None], mirrored(pattern), ways[0])
-    state = replace(
-        state,
-        turn=np.where(odd[:, None, None], state.turn * np.array([-1.0, 1.0, -1.0]), state.turn),
+    handed = np.where(odd[:, None], mirrored_numbering(pattern), numberings[0])
+    mirrored = state.rotation * np.array([-1.0, 1.0, -1.0])
+    state = replace(state, rotation=np.where(odd[:, None, None], mirrored, state.rotation))
+    rotations = symmetry_rotations(observations.flat, numberings)
+    evidence = _ShapeEvidence.of(
+        state, observations.renumbered(handed), sigma_px, numberings, rotations
     )
-    turns = way_turns(sightings.flat, ways)
-    told = _Told.of(state, sightings.renumbered(handed), sigma_px, ways, turns)
-    best, best_gain = np.zeros(len(sightings), np.int64), -np.inf
-    for first in range(min(len(sightings), _STARTS)):
-        chosen = np.zeros(len(sightings), np.int64)
-        shape = told.shape(chosen, np.arange(len(chosen)) == first)
+    every = np.arange(count)
+    best, best_gain = np.zeros(count, np.int64), -np.inf
+    for first in range(min(count, _STARTS)):
+        chosen = np.zeros(count, np.int64)
+        shape = evidence.shape(chosen, every[first : first + 1])
         for _ in range(_ROUNDS):
-            again = np.argmax(told.gains(shape), axis=0)
-            shape = told.shape(again)
+            again = np.argmax(evidence.gains(shape), axis=0)
+            shape = evidence.shape(again, every)
             if (again == chosen).all():
                 break
             chosen = again
-        gain = float(told.gains(shape)[chosen, np.arange(len(chosen))].sum())
+        gain = float(evidence.gains(shape)[chosen, every].sum())
         if gain > best_gain + 1e-6 * abs(best_gain) or not np.isfinite(best_gain):
             best, best_gain = chosen, gain
-    if len(ways) == 2 and best.mean() > 0.5:  # counted as most pictures are
+    if len(numberings) == 2 and best.mean() > 0.5:  # numbered as most images are
         best = 1 - best
-    return np.take_along_axis(handed, ways[best], axis=1), replace(
-        state, turn=state.turn @ turns[best]
-    )
+    numbering = np.take_along_axis(handed, numberings[best], axis=1)
+    return numbering, replace(state, rotation=state.rotation @ rotations[best])
 
 
 @dataclass(frozen=True)
-class _Told:
-    """What each picture alone says of the shape, linear about the flat board, its pose left free.
+class _ShapeEvidence:
+    """Each image's equations for the shape, linear about the flat board, its pose eliminated.
 
-    For every way n of counting: `local` [n, V, C, 3, 3] less `factor` [n, V, 6, 3C] squared is the
+    For every numbering n: `local` [n, V, C, 3, 3] less `factor` [n, V, 6, 3C] squared is the
     normal matrix, `right` [n, V, 3C] the right hand side.
     """
 
     local: FloatArray
     factor: FloatArray
     right: FloatArray
-    prior: FloatArray
 
     @staticmethod
     def of(
-        state: State, sightings: Sightings, sigma_px: float, ways: IntArray, turns: FloatArray
-    ) -> _Told:
-        jac = jacobian(replace(state, shape=np.zeros_like(state.shape)), sightings.flat)
-        root = sightings.seen[..., None] / sigma_px
-        error = (sightings.uv_px - jac.uv_px) * root
+        state: CalibrationState,
+        observations: CornerObservations,
+        sigma_px: float,
+        numberings: IntArray,
+        rotations: FloatArray,
+    ) -> _ShapeEvidence:
+        jac = jacobian(replace(state, shape=np.zeros_like(state.shape)), observations.flat)
+        root = observations.visible[..., None] / sigma_px
+        error = (observations.uv_px - jac.uv_px) * root
         bent, pose = jac.shape * root[..., None], jac.pose * root[..., None]
-        views, count = sightings.seen.shape
+        views, count = observations.visible.shape
         local = bent.transpose(0, 1, 3, 2) @ bent
         right = (bent * error[..., None]).sum(2)  # [V, C, 3]
         strip = (pose.transpose(0, 1, 3, 2) @ bent).transpose(0, 2, 1, 3)  # [V, 6, C, 3]
@@ -156,36 +160,31 @@ class _Told:
         block = tall.transpose(0, 2, 1) @ tall
         slope = tall.transpose(0, 2, 1) @ error.reshape(views, -1, 1)
         inverse = np.linalg.inv(np.linalg.cholesky(block))
-        factor = (inverse @ strip.reshape(views, 6, -1)).reshape(views, 6, count, 3)
-        right = right - ((inverse @ slope).transpose(0, 2, 1) @ factor.reshape(views, 6, -1))[
-            :, 0
-        ].reshape(views, count, 3)
-        shape = (len(ways), views)
-        return _Told(
-            np.stack([t.T @ local[:, w] @ t for w, t in zip(ways, turns, strict=True)]),
-            np.stack([factor[:, :, w] @ t for w, t in zip(ways, turns, strict=True)]).reshape(
-                *shape, 6, -1
-            ),
-            np.stack([right[:, w] @ t for w, t in zip(ways, turns, strict=True)]).reshape(
-                *shape, -1
-            ),
-            prior_weights(count),
+        flat_factor = inverse @ strip.reshape(views, 6, -1)
+        factor = flat_factor.reshape(views, 6, count, 3)
+        known = (inverse @ slope).transpose(0, 2, 1) @ flat_factor
+        right = right - known[:, 0].reshape(views, count, 3)
+        ways = list(zip(numberings, rotations, strict=True))
+        size = (len(ways), views)
+        return _ShapeEvidence(
+            np.stack([r.T @ local[:, n] @ r for n, r in ways]),
+            np.stack([factor[:, :, n] @ r for n, r in ways]).reshape(*size, 6, -1),
+            np.stack([right[:, n] @ r for n, r in ways]).reshape(*size, -1),
         )
 
-    def shape(self, chosen: IntArray, only: BoolArray | None = None) -> FloatArray:
-        """[3C] the shape that the pictures (or `only` some) agree on, counted as `chosen` [V]."""
-        rows = np.arange(len(chosen)) if only is None else np.flatnonzero(only)
+    def shape(self, chosen: IntArray, rows: IntArray) -> FloatArray:
+        """[3C] the shape on which the images `rows` agree, numbered as `chosen` [V]."""
         local = self.local[chosen[rows], rows].sum(0)
         factor = self.factor[chosen[rows], rows].reshape(-1, self.right.shape[-1])
-        normal = np.diag(self.prior) - factor.T @ factor
         count = len(local)
+        normal = np.diag(prior_weights(count)) - factor.T @ factor
         blocks = normal.reshape(count, 3, count, 3)
         blocks[np.arange(count), :, np.arange(count)] += local
         return np.asarray(np.linalg.solve(normal, self.right[chosen[rows], rows].sum(0)))
 
     def gains(self, shape: FloatArray) -> FloatArray:
-        """[n, V] by how much the shape lowers each picture's cost under each way of counting."""
+        """[n, V] how much the shape lowers each image's cost under each numbering."""
         corners = shape.reshape(-1, 3)
         bent = np.einsum("nvcij,ci,cj->nv", self.local, corners, corners)
-        moved = ((self.factor @ shape) ** 2).sum(-1)
-        return np.asarray(2 * self.right @ shape - bent + moved)
+        eliminated = ((self.factor @ shape) ** 2).sum(-1)
+        return np.asarray(2 * self.right @ shape - bent + eliminated)

@@ -1,8 +1,8 @@
 """Bundle adjustment on the projection itself: Levenberg-Marquardt, then soft-L1.
 
-The paper's two stages. The first minimises the squared distance between projected and seen
+The paper's two stages. The first minimises the squared distance between projected and observed
 corners; the second a soft-L1 loss of the distance, which grows like the distance instead of its
-square, so that a wrong corner pulls no harder than a slightly wrong one. Each has its own
+square, so a wrong corner pulls no harder than a slightly wrong one. Each stage has its own
 criterion, and a stage whose result is worse by it than its start is not kept.
 """
 
@@ -12,24 +12,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.geometry.lens import unit_radius
 from bikeped.lab.calibration.solver.board_shape import gauge_basis, prior_weights
 from bikeped.lab.calibration.solver.jacobian import Jacobian, jacobian
 from bikeped.lab.calibration.solver.lens_model import (
     PLAIN,
-    Model,
-    Sightings,
-    State,
-    angles,
-    camera_points,
-    gain,
+    CalibrationState,
+    CornerObservations,
+    LensModel,
+    corner_angles,
     residuals,
 )
-from bikeped.lab.calibration.solver.normal_equations import Normal, moved, normal_equations
-from bikeped.lab.calibration.solver.single_thread import one_thread
+from bikeped.lab.calibration.solver.normal_equations import (
+    NormalEquations,
+    apply_step,
+    normal_equations,
+    single_threaded,
+)
 from bikeped.types import BoolArray, FloatArray
 
-#: The distance's median of plain noise is this many standard deviations of one coordinate.
+#: Median distance of plain noise, in standard deviations of one coordinate.
 MEDIAN_OF_NOISE = 1.17741
 #: The loss turns from squared to linear here, in standard deviations of one coordinate.
 SOFT_L1_TURN = 3.0
@@ -40,8 +41,8 @@ _SAME_COST = 1e-9
 
 
 @dataclass(frozen=True)
-class Stage:
-    """How one stage went: for the report, and for whoever doubts it."""
+class AdjustmentStage:
+    """How one stage of the adjustment went, for the report."""
 
     name: str
     steps: int
@@ -53,25 +54,31 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Adjusted:
-    """A state at its best, how it got there, and what it leaves."""
+class AdjustmentResult:
+    """The state at the optimum, the stages that led there, and the residuals."""
 
-    model: Model
-    state: State
-    stages: tuple[Stage, ...]
-    residuals_px: FloatArray  #: [V, C, 2], zero where unseen
+    model: LensModel
+    state: CalibrationState
+    stages: tuple[AdjustmentStage, ...]
+    residuals_px: FloatArray  #: [V, C, 2], zero where not visible
     sigma_px: float  #: noise of one coordinate, from the median distance
 
 
-def noise_px(error: FloatArray, seen: BoolArray) -> float:
+def noise_px(error: FloatArray, visible: BoolArray) -> float:
     """Standard deviation of one coordinate of `error` [V, C, 2], by the median of the distances."""
-    distance = np.hypot(error[..., 0], error[..., 1])[seen]
+    distance = np.hypot(error[..., 0], error[..., 1])[visible]
     return max(float(np.median(distance)) / MEDIAN_OF_NOISE, _FLOOR_PX)
 
 
-@one_thread
-def adjust(sightings: Sightings, model: Model, start: State, *, robust: bool = True) -> Adjusted:
-    """Both stages from `start` (whose lens is cut or filled up with zeros to the model's terms).
+@single_threaded
+def adjust(
+    observations: CornerObservations,
+    model: LensModel,
+    start: CalibrationState,
+    *,
+    robust: bool = True,
+) -> AdjustmentResult:
+    """Both stages from `start`, its lens cut or padded with zeros to the model's radial terms.
 
     `robust` False leaves the second stage out.
     """
@@ -81,110 +88,120 @@ def adjust(sightings: Sightings, model: Model, start: State, *, robust: bool = T
     state = replace(start, projection=model.projection, lens=lens)
     if not model.board:
         state = replace(state, shape=np.zeros_like(state.shape))
-    stages = []
-    state, stage = _kept(sightings, model, state, None, "levenberg-marquardt")
-    stages.append(stage)
-    error = residuals(state, sightings)
+    state, stage = _run_stage(observations, model, state, None, "levenberg-marquardt")
+    stages = [stage]
+    error = residuals(state, observations)
     if robust:
-        for _ in range(4):  # until the scale, which each pass lowers where corners are wrong, rests
-            scale = noise_px(error, sightings.seen) * SOFT_L1_TURN
-            state, stage = _kept(sightings, model, state, scale, "soft-l1")
+        for _ in range(4):  # until the scale, which falls with every wrong corner, settles
+            scale = noise_px(error, observations.visible) * SOFT_L1_TURN
+            state, stage = _run_stage(observations, model, state, scale, "soft-l1")
             stages.append(stage)
-            error = residuals(state, sightings)
-            if noise_px(error, sightings.seen) * SOFT_L1_TURN > 0.9 * scale:
+            error = residuals(state, observations)
+            if noise_px(error, observations.visible) * SOFT_L1_TURN > 0.9 * scale:
                 break
-    return Adjusted(model, state, tuple(stages), error, noise_px(error, sightings.seen))
+    sigma_px = noise_px(error, observations.visible)
+    return AdjustmentResult(model, state, tuple(stages), error, sigma_px)
 
 
-def readjust(sightings: Sightings, fitted: Adjusted) -> State:
-    """The last stage again, from a fit to other (or more) pictures: for cross-validation.
+def refit_robust(observations: CornerObservations, fitted: AdjustmentResult) -> CalibrationState:
+    """The last stage again on other images, for cross-validation.
 
     At the fit's own scale: the criterion must not change with the fold.
     """
     turn_px = fitted.sigma_px * SOFT_L1_TURN
-    return _kept(sightings, fitted.model, fitted.state, turn_px, "soft-l1")[0]
+    return _run_stage(observations, fitted.model, fitted.state, turn_px, "soft-l1")[0]
 
 
 @dataclass(frozen=True)
-class Linear:
-    """The last stage's equations at a fit: what it would be without some pictures, by one step.
+class LinearizedFit:
+    """The last stage's equations at a fit, which give the fit without some images in one step.
 
-    A lens that many pictures made moves little when a few are taken away, and one undamped step of
-    Gauss and Newton from the optimum gets there (to 1 % of the held-out error, tested).
+    With many images a fit moves little when a few are removed, and one undamped Gauss-Newton step
+    from the optimum gets there (to 1 % of the held-out error, tested).
     """
 
-    fitted: Adjusted
+    fitted: AdjustmentResult
     jac: Jacobian
-    pulled: FloatArray
-    seen: FloatArray
-    prior: _Prior | None
+    weighted_px: FloatArray
+    visible: FloatArray
+    prior: ShapePrior | None
 
     @staticmethod
-    def of(sightings: Sightings, fitted: Adjusted) -> Linear:
-        jac, pulled = whitened(
-            jacobian(fitted.state, sightings.flat, bent=fitted.model.board),
+    def of(observations: CornerObservations, fitted: AdjustmentResult) -> LinearizedFit:
+        jac, weighted_px = whitened(
+            jacobian(fitted.state, observations.flat, bent=fitted.model.board),
             fitted.residuals_px,
             fitted.sigma_px * SOFT_L1_TURN,
         )
-        prior = _Prior.of(sightings, fitted.state) if fitted.model.board else None
-        return Linear(fitted, jac, pulled, sightings.seen.astype(np.float64), prior)
+        prior = ShapePrior.of(observations, fitted.state) if fitted.model.board else None
+        visible = observations.visible.astype(np.float64)
+        return LinearizedFit(fitted, jac, weighted_px, visible, prior)
 
-    def without(self, out: BoolArray) -> State:
-        """Lens and shape as the pictures that are not `out` [V] have them; poses of those."""
+    def without(self, out: BoolArray) -> CalibrationState:
+        """Lens and shape fitted to the images that are not `out` [V], and these images' poses."""
         keep, state = ~out, self.fitted.state
         jac = Jacobian(*(part[keep] for part in self.jac.parts))
         basis = None if self.prior is None else self.prior.basis
-        normal = normal_equations(jac, self.pulled[keep], self.seen[keep], basis)
+        normal = normal_equations(jac, self.weighted_px[keep], self.visible[keep], basis)
         if self.prior is not None:
             normal = self.prior.added(normal, state)
-        return moved(state.rows(keep), normal.step(0.0), basis)
+        return apply_step(state.rows(keep), normal.step(0.0), basis)
 
 
-def _kept(
-    sightings: Sightings, model: Model, start: State, turn_px: float | None, name: str
-) -> tuple[State, Stage]:
-    """One stage, and its result only if that is better and still a lens."""
-    found, stage = minimise(sightings, model, start, turn_px, name)
-    grows = lens_grows(found, sightings)
-    better = stage.cost_after <= stage.cost_before and np.isfinite(stage.cost_after) and grows
-    if better:
+def _run_stage(
+    observations: CornerObservations,
+    model: LensModel,
+    start: CalibrationState,
+    turn_px: float | None,
+    name: str,
+) -> tuple[CalibrationState, AdjustmentStage]:
+    """One stage, and its result only if that is better and its radius grows with the angle."""
+    found, stage = minimise(observations, model, start, turn_px, name)
+    monotonic = radius_is_monotonic(found, observations)
+    if monotonic and np.isfinite(stage.cost_after) and stage.cost_after <= stage.cost_before:
         return found, stage
-    why = stage.stopped if grows else "the radius would shrink with the angle"
+    why = stage.stopped if monotonic else "the radius would shrink with the angle"
     return start, replace(stage, kept=False, stopped=why)
 
 
-def lens_grows(state: State, sightings: Sightings) -> bool:
-    """Whether the lens's radius grows with the angle wherever corners were seen."""
+def radius_is_monotonic(state: CalibrationState, observations: CornerObservations) -> bool:
+    """Whether the lens's radius grows with the angle wherever corners were observed."""
     if not (np.isfinite(state.lens).all() and state.lens[2] > 0):
         return False
     if not len(state.lens) > PLAIN:
         return True
-    seen = angles(camera_points(state, sightings.flat))[sightings.seen]
-    theta: FloatArray = np.linspace(0.0, float(np.quantile(seen, 0.98)), 200, dtype=np.float64)
-    radius = unit_radius(state.projection, theta) * gain(theta, state.lens[PLAIN:])
-    return bool(np.all(np.diff(radius) > 0)) or state.projection == "orthographic"
+    observed = corner_angles(state, observations)[observations.visible]
+    theta: FloatArray = np.linspace(0.0, float(np.quantile(observed, 0.98)), 200, dtype=np.float64)
+    growing = np.all(np.diff(state.radius_px(theta)) > 0)
+    return bool(growing) or state.projection == "orthographic"
 
 
 def minimise(
-    sightings: Sightings, model: Model, start: State, turn_px: float | None, name: str
-) -> tuple[State, Stage]:
-    """Levenberg-Marquardt on the squared (`turn_px` None) or the soft-L1 loss, turning linear at
-    `turn_px`; the latter by weights, so that every step is an ordinary one."""
-    flat = sightings.flat
-    prior = _Prior.of(sightings, start) if model.board else None
+    observations: CornerObservations,
+    model: LensModel,
+    start: CalibrationState,
+    turn_px: float | None,
+    name: str,
+) -> tuple[CalibrationState, AdjustmentStage]:
+    """Levenberg-Marquardt on the squared (`turn_px` None) or the soft-L1 loss.
+
+    The latter turns linear at `turn_px`; it is minimised by reweighted least-squares steps.
+    """
+    flat = observations.flat
+    prior = ShapePrior.of(observations, start) if model.board else None
     basis = None if prior is None else prior.basis
 
-    def cost_of(error: FloatArray, state: State) -> float:
+    def cost_of(error: FloatArray, state: CalibrationState) -> float:
         return loss(error, turn_px) + (0.0 if prior is None else prior.cost(state))
 
     state = start
-    error = residuals(state, sightings)
+    error = residuals(state, observations)
     before = cost = cost_of(error, state)
     damping = _FIRST_DAMPING if turn_px is None else _NEAR_DAMPING
     steps, stopped, slope = 0, "the most steps were taken", np.inf
     while steps < _MOST_STEPS:
-        jac, pulled = whitened(jacobian(state, flat, bent=model.board), error, turn_px)
-        normal = normal_equations(jac, pulled, sightings.seen.astype(np.float64), basis)
+        jac, weighted_px = whitened(jacobian(state, flat, bent=model.board), error, turn_px)
+        normal = normal_equations(jac, weighted_px, observations.visible.astype(np.float64), basis)
         if prior is not None:
             normal = prior.added(normal, state)
         slope = normal.slope_size
@@ -193,7 +210,7 @@ def minimise(
         for _ in range(_MOST_DAMPINGS):
             trial = _trial(state, normal, damping, basis)
             if trial is not None:
-                trial_error = residuals(trial, sightings)
+                trial_error = residuals(trial, observations)
                 trial_cost = cost_of(trial_error, trial)
                 gained = cost - trial_cost
                 if gained >= 0:
@@ -207,29 +224,29 @@ def minimise(
         if gained <= _SAME_COST * cost + 1e-18:
             stopped = "a step made it better by less than a part in 10^9"
             break
-    return state, Stage(name, steps, before, cost, float(slope), stopped, True)
+    return state, AdjustmentStage(name, steps, before, cost, float(slope), stopped, True)
 
 
 @dataclass(frozen=True)
-class _Prior:
-    """What keeps the board's shape from standing for noise: see `board_shape`."""
+class ShapePrior:
+    """The prior that keeps the board's shape from fitting noise: see `board_shape`."""
 
     basis: FloatArray
     weight: FloatArray  #: [3C] pixels squared per square squared
     block: FloatArray
 
     @staticmethod
-    def of(sightings: Sightings, state: State) -> _Prior:
-        basis = gauge_basis(sightings.flat)
-        sigma = noise_px(residuals(state, sightings), sightings.seen)
-        weight = prior_weights(len(sightings.flat)) * sigma**2
-        return _Prior(basis, weight, basis.T @ (weight[:, None] * basis))
+    def of(observations: CornerObservations, state: CalibrationState) -> ShapePrior:
+        basis = gauge_basis(observations.flat)
+        sigma = noise_px(residuals(state, observations), observations.visible)
+        weight = prior_weights(len(observations.flat)) * sigma**2
+        return ShapePrior(basis, weight, basis.T @ (weight[:, None] * basis))
 
-    def cost(self, state: State) -> float:
+    def cost(self, state: CalibrationState) -> float:
         return float((self.weight * state.shape.reshape(-1) ** 2).sum())
 
-    def added(self, normal: Normal, state: State) -> Normal:
-        """The equations with the prior's in them."""
+    def added(self, normal: NormalEquations, state: CalibrationState) -> NormalEquations:
+        """The equations with the prior added."""
         m = len(state.lens)
         shared, slope = normal.shared.copy(), normal.shared_slope.copy()
         shared[m:, m:] += self.block
@@ -237,13 +254,15 @@ class _Prior:
         return replace(normal, shared=shared, shared_slope=slope)
 
 
-def _trial(state: State, normal: Normal, damping: float, basis: FloatArray | None) -> State | None:
-    """The state one damped step on; None where there is no such lens."""
+def _trial(
+    state: CalibrationState, normal: NormalEquations, damping: float, basis: FloatArray | None
+) -> CalibrationState | None:
+    """The state after one damped step; None where that gives no lens."""
     try:
         step = normal.step(damping)
     except np.linalg.LinAlgError:
         return None
-    trial = moved(state, step, basis)
+    trial = apply_step(state, step, basis)
     return trial if np.isfinite(trial.lens).all() and trial.lens[2] > 0 else None
 
 

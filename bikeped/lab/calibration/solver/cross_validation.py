@@ -1,8 +1,7 @@
-"""Cross-validation: how well the lens predicts pictures that did not help to fit it.
+"""Cross-validation: how well the lens predicts images that were not used to fit it.
 
-The pictures are dealt into folds. Lens and board shape are fitted on all folds but one; on the one
-held out only the poses are fitted, with lens and shape as they are; what is left there is counted.
-A model that bends to the noise of its own pictures is found out.
+The images are split into folds. Lens and board shape are fitted on all folds but one; on the
+held-out fold only the poses are fitted, and its residuals count. This reveals overfitting.
 """
 
 from __future__ import annotations
@@ -11,68 +10,86 @@ from dataclasses import replace
 
 import numpy as np
 
-from bikeped.lab.calibration.solver.bundle_adjustment import Adjusted, Linear, readjust
+from bikeped.lab.calibration.solver.bundle_adjustment import (
+    AdjustmentResult,
+    LinearizedFit,
+    refit_robust,
+)
 from bikeped.lab.calibration.solver.jacobian import jacobian
-from bikeped.lab.calibration.solver.lens_model import Sightings, State, residuals, rotations
-from bikeped.lab.calibration.solver.single_thread import one_thread
+from bikeped.lab.calibration.solver.lens_model import (
+    CalibrationState,
+    CornerObservations,
+    residuals,
+    rotations,
+)
+from bikeped.lab.calibration.solver.normal_equations import single_threaded
 from bikeped.types import FloatArray, IntArray
 
-#: Fewer pictures than this are fitted anew for every fold; with more, one step is as good.
-_FIT_ANEW = 10
+#: Fewer images than this are refitted for every fold; with more, one linear step is as good.
+_REFIT_BELOW = 10
 
 
-def folds_of(pictures: int, folds: int) -> IntArray:
-    """[pictures] the fold of each: dealt in turn, so that neighbours in time are split.
+def assign_folds(images: int, folds: int) -> IntArray:
+    """[images] the fold of each, in turn, so that neighbours in time are split.
 
-    `folds` 0: each picture by itself.
+    `folds` 0: each image is a fold.
     """
-    return np.arange(pictures) % min(folds or pictures, pictures)
+    return np.arange(images) % min(folds or images, images)
 
 
-@one_thread
-def held_out_residuals(fitted: Adjusted, sightings: Sightings, folds: int) -> FloatArray:
-    """[V, C, 2] residuals of each picture under the lens that the other folds give, pixels."""
-    fold = folds_of(len(sightings), folds)
-    linear = Linear.of(sightings, fitted) if len(sightings) >= _FIT_ANEW else None
-    lens = np.empty((len(sightings), 1, len(fitted.state.lens)))
-    shape = np.empty((len(sightings), *fitted.state.shape.shape))
+@single_threaded
+def held_out_residuals(
+    fitted: AdjustmentResult, observations: CornerObservations, folds: int
+) -> FloatArray:
+    """[V, C, 2] residuals of each image under the lens that the other folds give, pixels."""
+    fold = assign_folds(len(observations), folds)
+    linear = LinearizedFit.of(observations, fitted) if len(observations) >= _REFIT_BELOW else None
+    lens = np.empty((len(observations), 1, len(fitted.state.lens)))
+    shape = np.empty((len(observations), *fitted.state.shape.shape))
     for number in range(fold.max() + 1):
         out = fold == number
         if linear is not None:
             train = linear.without(out)
         else:
             near = replace(fitted, state=fitted.state.rows(~out))
-            train = readjust(sightings.rows(~out), near)
+            train = refit_robust(observations.rows(~out), near)
         lens[out], shape[out] = train.lens, train.shape
     state = replace(fitted.state, lens=lens, shape=shape)
-    return residuals(fit_poses(state, sightings), sightings)
+    return residuals(fit_poses(state, observations), observations)
 
 
-def fit_poses(start: State, sightings: Sightings, steps: int = 20) -> State:
-    """The poses that fit best under the lens and shape of `start`, each picture by itself."""
+def fit_poses(
+    start: CalibrationState, observations: CornerObservations, steps: int = 20
+) -> CalibrationState:
+    """The best poses under the lens and shape of `start`, each image by itself."""
     state = start
-    error = residuals(state, sightings)
+    error = residuals(state, observations)
     cost: FloatArray = np.asarray((error * error).sum((1, 2)))
     damping: FloatArray = np.full(len(cost), 1e-8)
     index = np.arange(6)
     for _ in range(steps):
-        jac = jacobian(state, sightings.flat, bent=False).pose * sightings.seen[..., None, None]
+        jac = (
+            jacobian(state, observations.flat, bent=False).pose
+            * observations.visible[..., None, None]
+        )
         tall = jac.reshape(len(cost), -1, 6)
         normal = tall.transpose(0, 2, 1) @ tall
         slope = (tall.transpose(0, 2, 1) @ error.reshape(len(cost), -1, 1))[..., 0]
         normal[:, index, index] *= 1 + damping[:, None]
         step: FloatArray = np.asarray(-np.linalg.solve(normal, slope[..., None])[..., 0])
         trial = replace(
-            state, turn=rotations(step[:, :3]) @ state.turn, move=state.move + step[:, 3:]
+            state,
+            rotation=rotations(step[:, :3]) @ state.rotation,
+            translation=state.translation + step[:, 3:],
         )
-        trial_error = residuals(trial, sightings)
+        trial_error = residuals(trial, observations)
         trial_cost = (trial_error * trial_error).sum((1, 2))
         better = trial_cost <= cost
         rests = np.abs(cost - trial_cost) <= 1e-9 * cost + 1e-18
         state = replace(
             state,
-            turn=np.where(better[:, None, None], trial.turn, state.turn),
-            move=np.where(better[:, None], trial.move, state.move),
+            rotation=np.where(better[:, None, None], trial.rotation, state.rotation),
+            translation=np.where(better[:, None], trial.translation, state.translation),
         )
         error = np.where(better[:, None, None], trial_error, error)
         cost = np.asarray(np.where(better, trial_cost, cost))

@@ -3,7 +3,7 @@
 For every projection and a range of focal lengths the corners become rays; a flat board's corners
 and their rays obey b x (H P) = 0 with H = [r1 r2 t], linear in H, and true for rays beside and
 behind the lens plane as well (a homography between planes would not be). The guess whose boards
-come back nearest to where they were seen wins.
+project nearest to the observed corners wins.
 """
 
 from __future__ import annotations
@@ -13,34 +13,38 @@ import numpy as np
 from bikeped.errors import CalibrationError
 from bikeped.geometry.lens import LIMITS, Projection, unit_radius
 from bikeped.lab.calibration.solver.lens_model import (
-    Sightings,
-    State,
+    CalibrationState,
+    CornerObservations,
     bearings,
     camera_points,
     project,
 )
-from bikeped.lab.calibration.solver.single_thread import one_thread
+from bikeped.lab.calibration.solver.normal_equations import single_threaded
 from bikeped.types import FloatArray
 
 FISHEYE: tuple[Projection, ...] = ("equidistant", "equisolid", "stereographic", "orthographic")
 #: Angles that the farthest corner may lie at, degrees from the axis.
 _FARTHEST_DEG = (20.0, 30.0, 42.0, 55.0, 68.0, 80.0, 90.0, 100.0, 112.0, 125.0)
-_SCANNED = 10  # pictures that the scan looks at: the choice needs no more
+_SCANNED = 10  # images that the scan uses: the choice needs no more
 _REWEIGHTED = 4
 
 
-@one_thread
-def first_guess(sightings: Sightings, projections: tuple[Projection, ...] = FISHEYE) -> State:
-    """Lens (no radial terms) and poses; CalibrationError when no guess makes sense of a board.
+@single_threaded
+def first_guess(
+    observations: CornerObservations, projections: tuple[Projection, ...] = FISHEYE
+) -> CalibrationState:
+    """Lens (no radial terms) and poses; CalibrationError where no lens explains the boards.
 
     The first projection is scanned over all angles, the others near the best of these.
     """
-    centre = np.array([(sightings.width - 1) / 2, (sightings.height - 1) / 2])
-    offset = np.where(sightings.seen, np.linalg.norm(sightings.uv_px - centre, axis=-1), 0.0)
+    centre = np.array([(observations.width - 1) / 2, (observations.height - 1) / 2])
+    offset = np.where(
+        observations.visible, np.linalg.norm(observations.uv_px - centre, axis=-1), 0.0
+    )
     farthest = float(offset.max())
-    # The farthest boards tell projections apart; some near ones keep them honest.
+    # The farthest boards tell projections apart; some near ones stabilise the choice.
     order = np.argsort(offset.max(axis=1))[::-1]
-    some = sightings.rows(np.sort(order[:: max(1, len(order) // _SCANNED)][:_SCANNED]))
+    some = observations.rows(np.sort(order[:: max(1, len(order) // _SCANNED)][:_SCANNED]))
     best: tuple[float, Projection, float] | None = None
     chosen = 0.0
     for projection in projections:
@@ -50,12 +54,12 @@ def first_guess(sightings: Sightings, projections: tuple[Projection, ...] = FISH
             if focal is None:
                 continue
             state = poses_from_rays(projection, np.array([*centre, focal]), some, reweighted=2)
-            score = float(np.mean(picture_errors_px(state, some)))
+            score = float(np.mean(median_errors_px(state, some)))
             if best is None or score < best[0]:
                 best, chosen = (score, projection, angle), focal
     if best is None or not np.isfinite(best[0]):
         raise CalibrationError("no lens makes a board of these corners; check --pattern")
-    return poses_from_rays(best[1], np.array([*centre, chosen]), sightings)
+    return poses_from_rays(best[1], np.array([*centre, chosen]), observations)
 
 
 def _near(angle_deg: float) -> tuple[float, ...]:
@@ -70,27 +74,27 @@ def _focal(projection: Projection, radius_px: float, theta: float) -> float | No
     return radius_px / float(unit_radius(projection, np.asarray(theta)))
 
 
-def picture_errors_px(state: State, sightings: Sightings) -> FloatArray:
-    """[V] median distance of each picture's corners from where the state puts them."""
-    error = project(state, camera_points(state, sightings.flat)) - sightings.uv_px
+def median_errors_px(state: CalibrationState, observations: CornerObservations) -> FloatArray:
+    """[V] median distance of each image's corners from their projections, pixels."""
+    error = project(state, camera_points(state, observations.flat)) - observations.uv_px
     distance = np.hypot(error[..., 0], error[..., 1])
-    return np.asarray(np.nanmedian(np.where(sightings.seen, distance, np.nan), axis=1))
+    return np.asarray(np.nanmedian(np.where(observations.visible, distance, np.nan), axis=1))
 
 
 def poses_from_rays(
     projection: Projection,
     lens: FloatArray,
-    sightings: Sightings,
+    observations: CornerObservations,
     reweighted: int = _REWEIGHTED,
-) -> State:
+) -> CalibrationState:
     """Every board's pose for a lens [cx, cy, f], robust to some wrong corners."""
-    flat = sightings.flat
+    flat = observations.flat
     half = float(np.abs(flat).max())
     plane = np.stack([flat[:, 0] / half, flat[:, 1] / half, np.ones(len(flat))], axis=1)
-    rays = bearings(projection, float(lens[2]), lens[:2], sightings.uv_px)
+    rays = bearings(projection, float(lens[2]), lens[:2], observations.uv_px)
     outer = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # [V, C, 3, 3]
     moments = plane[:, :, None] * plane[:, None, :]  # [C, 3, 3]
-    weight = sightings.seen.astype(np.float64)
+    weight = observations.visible.astype(np.float64)
     for _ in range(reweighted):
         block = (outer.reshape(*outer.shape[:2], 9) * weight[..., None]).transpose(0, 2, 1)
         square = (block @ moments.reshape(-1, 9)).reshape(-1, 3, 3, 3, 3)
@@ -98,20 +102,24 @@ def poses_from_rays(
         mapped = np.linalg.eigh(matrix)[1][:, :, 0].reshape(-1, 3, 3)
         ahead = mapped @ plane.T  # [V, 3, C]
         along = (rays.transpose(0, 2, 1) * ahead).sum(1)
-        sign = np.sign((np.sign(along) * sightings.seen).sum(1) + 1e-9)
+        sign = np.sign((np.sign(along) * observations.visible).sum(1) + 1e-9)
         mapped, ahead, along = (
             x * sign.reshape(-1, *[1] * (x.ndim - 1)) for x in (mapped, ahead, along)
         )
-        # The angle between ray and corner: off in pixels about f times this.
+        # The angle between ray and corner; the error in pixels is about f times this.
         sine = np.linalg.norm(np.cross(rays, ahead.transpose(0, 2, 1)), axis=-1)
         off = np.arctan2(sine, along)
         size = np.linalg.norm(ahead, axis=1)
-        scale = np.nanmedian(np.where(sightings.seen, off, np.nan), axis=1, keepdims=True)
-        weight = sightings.seen / (np.maximum(off, scale + 1e-6) * size) / np.maximum(size, 1e-12)
+        scale = np.nanmedian(np.where(observations.visible, off, np.nan), axis=1, keepdims=True)
+        weight = (
+            observations.visible / (np.maximum(off, scale + 1e-6) * size) / np.maximum(size, 1e-12)
+        )
         weight = weight / weight.max(axis=1, keepdims=True)
-    first, second, move = mapped[..., 0] / half, mapped[..., 1] / half, mapped[..., 2]
+    first, second, translation = mapped[..., 0] / half, mapped[..., 1] / half, mapped[..., 2]
     length = (np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1)) / 2
     axes = np.stack([first, second, np.cross(first, second) / length[:, None]], axis=-1)
     left, _, right = np.linalg.svd(axes)
-    turn = left @ right
-    return State(projection, lens, turn, move / length[:, None], np.zeros((len(flat), 3)))
+    rotation = left @ right
+    return CalibrationState(
+        projection, lens, rotation, translation / length[:, None], np.zeros((len(flat), 3))
+    )

@@ -1,9 +1,9 @@
-"""How the pixels move with every parameter, in closed form.
+"""Derivatives of the pixels by every parameter, in closed form.
 
 With the camera point p = R X + t, s = hypot(px, py), theta = atan2(s, pz), n = |p| and the unit
 radius h(theta) = g(theta) (1 + k1 theta^2 + ...), a pixel is (cx, cy) + f h (px, py) / s. Its
-derivative along the radius is f h' dtheta, across it f h / s. Nothing divides by pz, so that boards
-beside and behind the lens plane are like any other.
+derivative along the radius is f h' dtheta, across it f h / s. Nothing divides by pz, so boards
+beside and behind the lens plane need no special case.
 """
 
 from __future__ import annotations
@@ -13,7 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.geometry.lens import unit_radius, unit_radius_slope
-from bikeped.lab.calibration.solver.lens_model import PLAIN, State, board_points, gain
+from bikeped.lab.calibration.solver.lens_model import (
+    PLAIN,
+    CalibrationState,
+    radial_factor,
+)
 from bikeped.types import FloatArray
 
 
@@ -21,8 +25,8 @@ from bikeped.types import FloatArray
 class Jacobian:
     """Pixels `uv_px` [V, C, 2], and their derivatives.
 
-    `lens` [V, C, 2, 3 + terms]; `pose` [V, C, 2, 6]: a small turn of the board about the camera's
-    axes (radians, applied after the turn that it has), then the move; `shape` [V, C, 2, 3]: the
+    `lens` [V, C, 2, 3 + terms]; `pose` [V, C, 2, 6]: a small rotation of the board about the
+    camera's axes (radians, after its own rotation), then the translation; `shape` [V, C, 2, 3]: the
     corner's own offset on the board.
     """
 
@@ -37,15 +41,14 @@ class Jacobian:
         return self.uv_px, self.lens, self.pose, self.shape
 
 
-def jacobian(state: State, flat: FloatArray, *, bent: bool = True) -> Jacobian:
+def jacobian(state: CalibrationState, flat: FloatArray, *, bent: bool = True) -> Jacobian:
     """The derivatives at `state` for a board that is `flat` [C, 3] plus the state's shape.
 
     `bent` False leaves the derivatives by the shape out: `shape` [V, C, 2, 0].
     """
-    turned = board_points(state, flat) @ state.turn.transpose(0, 2, 1)
-    point = turned + state.move[:, None]
-    # On the axis itself the direction across is free: a nudge of 1e-9 chooses one, and all limits
-    # come out right.
+    turned = (flat + state.shape) @ state.rotation.transpose(0, 2, 1)
+    point = turned + state.translation[:, None]
+    # On the axis itself the direction across is free: an offset of 1e-9 chooses one.
     length = np.linalg.norm(point, axis=-1)
     flat_side = np.hypot(point[..., 0], point[..., 1])
     nudge = np.where(flat_side < 1e-9 * length, 1e-9 * length, 0.0)
@@ -56,9 +59,9 @@ def jacobian(state: State, flat: FloatArray, *, bent: bool = True) -> Jacobian:
 
     k = state.lens[..., PLAIN:]
     base = unit_radius(state.projection, theta)
-    grown = gain(theta, k)
+    grown = radial_factor(theta, k)
     unit = base * grown
-    slope = unit_radius_slope(state.projection, theta) * grown + base * _bend(theta, k)
+    slope = unit_radius_slope(state.projection, theta) * grown + base * _radial_slope(theta, k)
     focal = state.lens[..., 2]
     ux, uy = x / side, y / side
 
@@ -92,15 +95,15 @@ def jacobian(state: State, flat: FloatArray, *, bent: bool = True) -> Jacobian:
     pose[..., 1] = qz * ax - qx * az
     pose[..., 2] = qx * ay - qy * ax
     pose[..., 3:] = to_point
-    shape = to_point @ state.turn[:, None] if bent else to_point[..., :0]
+    shape = to_point @ state.rotation[:, None] if bent else to_point[..., :0]
     radius = focal * unit
     centre = state.lens[..., :2]
     uv = np.stack([centre[..., 0] + radius * ux, centre[..., 1] + radius * uy], axis=-1)
     return Jacobian(uv, lens, pose, shape)
 
 
-def _bend(theta: FloatArray, k: FloatArray) -> FloatArray:
-    """Derivative of `gain`."""
+def _radial_slope(theta: FloatArray, k: FloatArray) -> FloatArray:
+    """Derivative of `radial_factor` by theta."""
     square = theta * theta
     total = np.zeros_like(theta)
     for number in range(k.shape[-1], 0, -1):

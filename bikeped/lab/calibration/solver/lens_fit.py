@@ -1,4 +1,4 @@
-"""One lens model fitted to a set of boards, with what a person needs to trust it."""
+"""One lens model fitted to a set of boards, with its errors and uncertainty."""
 
 from __future__ import annotations
 
@@ -8,36 +8,37 @@ import numpy as np
 
 from bikeped.geometry import Lens
 from bikeped.geometry.lens import unit_radius
-from bikeped.lab.calibration.solver.board_shape import gauge_basis, prior_weights
-from bikeped.lab.calibration.solver.bundle_adjustment import Adjusted, Stage, adjust
+from bikeped.lab.calibration.solver.bundle_adjustment import (
+    AdjustmentResult,
+    AdjustmentStage,
+    ShapePrior,
+    adjust,
+)
 from bikeped.lab.calibration.solver.cross_validation import held_out_residuals
 from bikeped.lab.calibration.solver.jacobian import jacobian
 from bikeped.lab.calibration.solver.lens_model import (
     PLAIN,
-    Model,
-    Sightings,
-    State,
-    angles,
-    camera_points,
-    gain,
+    CalibrationState,
+    CornerObservations,
+    LensModel,
+    corner_angles,
+    radial_factor,
 )
-from bikeped.lab.calibration.solver.normal_equations import normal_equations
-from bikeped.lab.calibration.solver.single_thread import one_thread
+from bikeped.lab.calibration.solver.normal_equations import normal_equations, single_threaded
 from bikeped.types import FloatArray
 
 
 @dataclass(frozen=True)
-class Fit:
-    """A model's best state and its errors. Arrays are [V, C, ...] as in the sightings."""
+class LensFit:
+    """A model's best state and its errors. Arrays are [V, C, ...] as in the observations."""
 
-    model: Model
-    state: State
-    stages: tuple[Stage, ...]
-    sightings: Sightings
+    model: LensModel
+    state: CalibrationState
+    stages: tuple[AdjustmentStage, ...]
+    observations: CornerObservations
     residuals_px: FloatArray
-    held_out_px: (
-        FloatArray | None
-    )  #: residuals of each picture when it did not help; None: not asked
+    #: Residuals of each image when it was held out; None: not cross-validated.
+    held_out_px: FloatArray | None
     covariance: FloatArray  #: of the lens's parameters, in the model's order
 
     @property
@@ -47,7 +48,7 @@ class Fit:
     @property
     def rms_px(self) -> float:
         """Per point: sqrt(mean(dx^2 + dy^2))."""
-        return rms_per_point(self.residuals_px, self.sightings)
+        return rms_per_point(self.residuals_px, self.observations)
 
     @property
     def rms_per_coordinate_px(self) -> float:
@@ -56,8 +57,15 @@ class Fit:
 
     @property
     def cross_validated_px(self) -> float | None:
-        """Per point, over pictures that did not help to fit the lens."""
-        return None if self.held_out_px is None else rms_per_point(self.held_out_px, self.sightings)
+        """Per point, over images that were held out."""
+        if self.held_out_px is None:
+            return None
+        return rms_per_point(self.held_out_px, self.observations)
+
+    @property
+    def ranking_px(self) -> float:
+        """The error by which models are ranked: cross-validated where known, else RMS per point."""
+        return self.cross_validated_px or self.rms_px
 
     @property
     def cx(self) -> float:
@@ -73,15 +81,17 @@ class Fit:
 
     @property
     def uncertainty(self) -> dict[str, float]:
-        """One standard deviation of each parameter of the lens. It knows the corners' noise only,
-        not a wrong model: see the cross-validated error."""
+        """One standard deviation of each lens parameter, from the corners' noise only.
+
+        It does not cover a wrong model: see the cross-validated error.
+        """
         sigma = np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
         return {n: float(s) for n, s in zip(self.model.parameters, sigma, strict=True)}
 
     def radius_sigma_px(self, theta: FloatArray) -> FloatArray:
         """One standard deviation of r(theta), from the covariance of f and the radial terms."""
         base = unit_radius(self.state.projection, theta)
-        slopes = [base * gain(theta, self.state.lens[PLAIN:])]
+        slopes = [base * radial_factor(theta, self.state.lens[PLAIN:])]
         slopes += [self.focal_px * base * theta ** (2 * n + 2) for n in range(self.model.terms)]
         rows = np.stack(slopes, axis=-1)
         inner = self.covariance[2:, 2:]
@@ -90,71 +100,67 @@ class Fit:
     @property
     def angles_rad(self) -> FloatArray:
         """[V, C] each corner's angle from the optical axis."""
-        return angles(camera_points(self.state, self.sightings.flat))
+        return corner_angles(self.state, self.observations)
 
     @property
     def measured_to_rad(self) -> float:
-        """The largest angle at which a corner was seen."""
-        return float(self.angles_rad[self.sightings.seen].max())
-
-    def radius(self, theta: FloatArray) -> FloatArray:
-        """r(theta) in pixels, also where no `Lens` is valid."""
-        return np.asarray(
-            self.focal_px
-            * unit_radius(self.state.projection, theta)
-            * gain(theta, self.state.lens[PLAIN:])
-        )
+        """The largest angle of an observed corner."""
+        return float(self.angles_rad[self.observations.visible].max())
 
     def lens(self, max_theta_rad: float) -> Lens:
         """The project's lens, valid to an angle; GeometryError where it cannot be."""
         return Lens(self.state.projection, self.focal_px, max_theta_rad, self.state.terms)
 
 
-@one_thread
-def fit(sightings: Sightings, model: Model, start: State, folds: int | None = None) -> Fit:
-    """Adjusts the model from `start`, its uncertainty, and cross-validates it over `folds`
-    (0: each picture by itself; None: not at all)."""
-    adjusted = adjust(sightings, model, start)
-    held_out = held_out_residuals(adjusted, sightings, folds) if folds is not None else None
-    return Fit(
+@single_threaded
+def fit_lens(
+    observations: CornerObservations,
+    model: LensModel,
+    start: CalibrationState,
+    folds: int | None = None,
+) -> LensFit:
+    """Adjusts the model from `start`, with its covariance, and cross-validates it over `folds`.
+
+    `folds` 0: each image is a fold; None: no cross-validation.
+    """
+    adjusted = adjust(observations, model, start)
+    held_out = held_out_residuals(adjusted, observations, folds) if folds is not None else None
+    return LensFit(
         model,
         adjusted.state,
         adjusted.stages,
-        sightings,
+        observations,
         adjusted.residuals_px,
         held_out,
-        covariance_of(adjusted, sightings),
+        _covariance(adjusted, observations),
     )
 
 
-def covariance_of(adjusted: Adjusted, sightings: Sightings) -> FloatArray:
-    """Covariance of the lens's parameters: the normal matrix without poses and shape, inverted,
-    times the variance that the residuals show."""
-    state, flat = adjusted.state, sightings.flat
-    basis = gauge_basis(flat) if adjusted.model.board else None
+def _covariance(adjusted: AdjustmentResult, observations: CornerObservations) -> FloatArray:
+    """Covariance of the lens's parameters: the normal matrix with poses and shape eliminated,
+    inverted, times the variance of the residuals."""
+    state, bent = adjusted.state, adjusted.model.board
+    prior = ShapePrior.of(observations, state) if bent else None
     normal = normal_equations(
-        jacobian(state, flat, bent=adjusted.model.board),
+        jacobian(state, observations.flat, bent=bent),
         adjusted.residuals_px,
-        sightings.seen.astype(np.float64),
-        basis,
+        observations.visible.astype(np.float64),
+        None if prior is None else prior.basis,
     )
-    free = 2 * sightings.seen.sum() - 6 * len(sightings) - len(state.lens)
-    square = float((adjusted.residuals_px**2).sum())
-    if basis is not None:
-        m = len(state.lens)
-        spread = prior_weights(len(flat)) * adjusted.sigma_px**2
-        normal.shared[m:, m:] += basis.T @ (spread[:, None] * basis)
-        free -= basis.shape[1]
-    variance = square / max(int(free), 1)
+    free = 2 * observations.visible.sum() - 6 * len(observations) - len(state.lens)
+    if prior is not None:
+        normal = prior.added(normal, state)
+        free -= prior.basis.shape[1]
+    variance = float((adjusted.residuals_px**2).sum()) / max(int(free), 1)
     return np.asarray(normal.reduced_inverse(len(state.lens)) * variance)
 
 
-def rms_per_point(error: FloatArray, sightings: Sightings) -> float:
-    """sqrt(mean(dx^2 + dy^2)) over the corners that were seen, pixels."""
-    return float(np.sqrt((error[sightings.seen] ** 2).sum(-1).mean()))
+def rms_per_point(error: FloatArray, observations: CornerObservations) -> float:
+    """sqrt(mean(dx^2 + dy^2)) over the visible corners, pixels."""
+    return float(np.sqrt((error[observations.visible] ** 2).sum(-1).mean()))
 
 
-def rms_by_picture(error: FloatArray, sightings: Sightings) -> FloatArray:
-    """[V] the same for each picture."""
-    count = sightings.seen.sum(1)
+def rms_by_image(error: FloatArray, observations: CornerObservations) -> FloatArray:
+    """[V] the same for each image."""
+    count = observations.visible.sum(1)
     return np.asarray(np.sqrt((error**2).sum((1, 2)) / np.maximum(count, 1)))

@@ -1,31 +1,53 @@
-"""The normal equations of the adjustment, in blocks.
+"""The normal equations of the adjustment, in blocks, and single-threaded linear algebra.
 
-Every picture's pose meets only its own corners: the normal matrix is one dense block for what all
-share (lens, board shape), one 6 x 6 block a picture, and the strips between them. Eliminating the
+A pose affects only its own image: the normal matrix is one dense block for what all images share
+(lens, board shape), one 6 x 6 block an image, and the strips between them. Eliminating the
 poses (the Schur complement) leaves a matrix as small as the lens has parameters.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from bikeped.lab.calibration.solver.jacobian import Jacobian
-from bikeped.lab.calibration.solver.lens_model import State, rotations
+from bikeped.lab.calibration.solver.lens_model import CalibrationState, rotations
 from bikeped.types import FloatArray
+
+F = TypeVar("F", bound=Callable[..., Any])
+_thread_pools = functools.cache(ThreadpoolController)
+
+
+def single_threaded(function: F) -> F:
+    """Runs the function with its linear algebra limited to one thread.
+
+    The matrices are small: a second thread costs more than it saves, some twenty times over where
+    other processes use the processor as well.
+    """
+
+    @functools.wraps(function)
+    def limited(*args: Any, **named: Any) -> Any:
+        with _thread_pools().limit(limits=1, user_api="blas"):
+            return function(*args, **named)
+
+    return limited  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
-class Step:
-    """A change of everything: `shared` [3 + terms + shape], `pose` [V, 6]."""
+class AdjustmentStep:
+    """A change of all parameters: `shared` [3 + terms + shape], `pose` [V, 6]."""
 
     shared: FloatArray
     pose: FloatArray
 
 
 @dataclass(frozen=True)
-class Normal:
+class NormalEquations:
     """Blocks of J'WJ and J'We: shared [p, p], [p]; poses [V, 6, 6], [V, 6]; strips [V, 6, p]."""
 
     shared: FloatArray
@@ -34,7 +56,7 @@ class Normal:
     pose_slope: FloatArray
     strip: FloatArray
 
-    def step(self, damping: float) -> Step:
+    def step(self, damping: float) -> AdjustmentStep:
         """The Levenberg-Marquardt step; numpy.linalg.LinAlgError where there is none."""
         pose, shared = self.pose.copy(), self.shared.copy()
         index = np.arange(6)
@@ -47,14 +69,14 @@ class Normal:
         flat_strip = self.strip.reshape(-1, len(shared))
         reduced = shared - flat_strip.T @ solved[..., :-1].reshape(flat_strip.shape)
         slope = self.shared_slope - flat_strip.T @ solved[..., -1].reshape(-1)
-        # Radial terms of theta^9 and a centre in pixels differ by orders: scale to ones.
+        # Radial terms and a centre in pixels differ by orders of magnitude: scale them.
         size = np.sqrt(np.maximum(np.diagonal(reduced), 1e-300))
         change = -np.linalg.solve(reduced / np.outer(size, size), slope / size) / size
-        return Step(change, -(solved[..., -1] + solved[..., :-1] @ change))
+        return AdjustmentStep(change, -(solved[..., -1] + solved[..., :-1] @ change))
 
     def reduced_inverse(self, size: int) -> FloatArray:
         """[size, size] the first part of the shared block's inverse, the poses eliminated: the
-        covariance for unit noise; infinite variances where the pictures leave it open."""
+        covariance for unit noise; infinite variances where the images leave it open."""
         solved = np.linalg.solve(self.pose, self.strip)
         flat_strip = self.strip.reshape(-1, len(self.shared))
         reduced = self.shared - flat_strip.T @ solved.reshape(flat_strip.shape)
@@ -70,7 +92,7 @@ class Normal:
 
     @property
     def slope_size(self) -> float:
-        """The largest slope, each in units of its own parameter's curvature: 0 at a minimum."""
+        """The largest gradient, each in units of its parameter's curvature: 0 at a minimum."""
         shared = np.abs(self.shared_slope) / np.sqrt(np.maximum(np.diagonal(self.shared), 1e-300))
         curvature = np.diagonal(self.pose, axis1=1, axis2=2)
         pose = np.abs(self.pose_slope) / np.sqrt(np.maximum(curvature, 1e-300))
@@ -82,10 +104,10 @@ def normal_equations(
     error: FloatArray,
     weight: FloatArray,
     shape_basis: FloatArray | None = None,
-) -> Normal:
+) -> NormalEquations:
     """Blocks for residuals `error` [V, C, 2] weighted by `weight` [V, C].
 
-    `shape_basis` [3C, q]: what of the board's shape is free; None: nothing.
+    `shape_basis` [3C, q]: the free offsets of the board's shape; None: a flat board.
     """
     views, corners = weight.shape
     own = np.concatenate([jac.pose, jac.lens], axis=-1).reshape(views, 2 * corners, -1)
@@ -108,10 +130,12 @@ def normal_equations(
         strip = np.concatenate([strip, wide], axis=-1)
         shared = np.block([[shared, lens_wide], [lens_wide.T, shape_block]])
         shared_slope = np.concatenate([shared_slope, shape_slope])
-    return Normal(shared, shared_slope, pose, slope[:, :6], strip)
+    return NormalEquations(shared, shared_slope, pose, slope[:, :6], strip)
 
 
-def moved(state: State, step: Step, shape_basis: FloatArray | None = None) -> State:
+def apply_step(
+    state: CalibrationState, step: AdjustmentStep, shape_basis: FloatArray | None = None
+) -> CalibrationState:
     """The state after a step."""
     lens = state.lens + step.shared[: len(state.lens)]
     shape = state.shape
@@ -120,7 +144,7 @@ def moved(state: State, step: Step, shape_basis: FloatArray | None = None) -> St
     return replace(
         state,
         lens=lens,
-        turn=rotations(step.pose[:, :3]) @ state.turn,
-        move=state.move + step.pose[:, 3:],
+        rotation=rotations(step.pose[:, :3]) @ state.rotation,
+        translation=state.translation + step.pose[:, 3:],
         shape=shape,
     )

@@ -1,7 +1,6 @@
-"""Pictures to calibrate from: files, folders and videos, one size, read when they are needed.
+"""Images to calibrate from: files, folders and videos, all of one size, decoded on demand.
 
-A picture is kept as the bytes that it came in: forty 12-megapixel pictures decoded would take half
-a gigabyte.
+An image is kept encoded: forty decoded 12-megapixel images would take half a gigabyte.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from bikeped.capture.opencv import silence_opencv
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.types import Frame, ImageArray
 
-#: A video is cut into pieces of this length, and the sharpest frame of each is looked at.
+#: A video is cut into pieces of this length; the sharpest frame of each is used.
 VIDEO_PIECE_S = 0.5
-#: Not more than this many pieces of one video: they get longer instead.
+#: At most so many pieces of one video: longer videos have longer pieces.
 VIDEO_PIECES = 150
-LEAST_SIDE_PX = 32  #: a board of the smallest squares that are found needs more
-_JUDGED_WIDTH = 640  # sharpness is compared on a picture of about this width
+LEAST_SIDE_PX = 32  #: a board of the smallest squares that are detected needs more
+_SHARPNESS_WIDTH = 640  # sharpness is measured on an image of about this width
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One picture, encoded or grey. `moving`: a video's frame, whose neighbours look like it."""
+class CalibrationImage:
+    """One image, encoded or grey. `moving`: a video's frame, similar to its neighbours."""
 
-    name: str  #: for people: the file's path, or `clip.mp4 frame 120`
+    name: str  #: the file's path, or `clip.mp4 frame 120`
     width: int
     height: int
     digest: str  #: SHA-256 of the file's (or the frame's) bytes
@@ -46,62 +45,62 @@ class Picture:
         return decode_grey(self.content, self.name)
 
 
-def load_pictures(paths: Iterable[Path | str]) -> list[Picture]:
-    """Pictures, folders of pictures and videos as `Picture`s of one size, in the order given.
+def load_images(paths: Iterable[Path | str]) -> list[CalibrationImage]:
+    """The images of files, folders and videos, of one size, in the order given.
 
-    CalibrationError, naming the file and the mend: missing, unreadable, of another size than the
-    first, or none at all.
+    CalibrationError, naming file and remedy: missing, unreadable, of another size than the first,
+    or none at all.
     """
-    pictures: list[Picture] = []
+    images: list[CalibrationImage] = []
     for entry in paths:
-        pictures.extend(_load(Path(entry)))
-    if not pictures:
+        images.extend(_load(Path(entry)))
+    if not images:
         raise CalibrationError(
             "no picture to calibrate from; name files, a folder of pictures or a video"
         )
-    check_sizes(pictures)
-    return pictures
+    check_image_sizes(images)
+    return images
 
 
-def check_sizes(pictures: Sequence[Picture]) -> None:
-    """CalibrationError where a picture holds no board or its size is not the first one's."""
-    first = pictures[0]
-    for picture in pictures:
-        if min(picture.width, picture.height) < LEAST_SIDE_PX:
+def check_image_sizes(images: Sequence[CalibrationImage]) -> None:
+    """CalibrationError where an image is too small for a board, or not of the first one's size."""
+    first = images[0]
+    for image in images:
+        if min(image.width, image.height) < LEAST_SIDE_PX:
             raise CalibrationError(
-                f"{picture.name}: is {picture.width}x{picture.height} pixels, too small for a "
+                f"{image.name}: is {image.width}x{image.height} pixels, too small for a "
                 "board; take the camera's own pictures, not thumbnails"
             )
-        if (picture.width, picture.height) != (first.width, first.height):
+        if (image.width, image.height) != (first.width, first.height):
             raise CalibrationError(
-                f"{picture.name}: is {picture.width}x{picture.height} pixels, but {first.name} is "
+                f"{image.name}: is {image.width}x{image.height} pixels, but {first.name} is "
                 f"{first.width}x{first.height}; calibrate pictures of one size at a time"
             )
 
 
-def pictures_hash(pictures: Sequence[Picture]) -> str:
-    """SHA-256 over the pictures' bytes in order of name, duplicates included."""
+def images_hash(images: Sequence[CalibrationImage]) -> str:
+    """SHA-256 over the images' bytes in order of name, duplicates included."""
     digest = hashlib.sha256()
-    for picture in sorted(pictures, key=lambda one: one.name):
-        digest.update(bytes.fromhex(picture.digest))
+    for image in sorted(images, key=lambda one: one.name):
+        digest.update(bytes.fromhex(image.digest))
     return digest.hexdigest()
 
 
 def decode_grey(content: bytes, name: str) -> ImageArray:
-    """[h, w] grey levels of an encoded picture; CalibrationError when it cannot be decoded."""
+    """[h, w] grey levels of an encoded image; CalibrationError when it cannot be decoded."""
     try:
         with silence_opencv():
             data = np.frombuffer(content, np.uint8)
             flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-            picture = cv2.imdecode(data, flags) if len(data) else None
+            image = cv2.imdecode(data, flags) if len(data) else None
     except cv2.error as error:
         raise CalibrationError(f"{name}: is no picture ({error.err}); remove it") from error
-    if picture is None:
+    if image is None:
         raise CalibrationError(f"{name}: is no picture that can be decoded; remove it")
-    return np.asarray(picture, np.uint8)
+    return np.asarray(image, np.uint8)
 
 
-def _load(path: Path) -> list[Picture]:
+def _load(path: Path) -> list[CalibrationImage]:
     if not path.exists():
         raise CalibrationError(f"{path}: no such file or folder")
     try:
@@ -112,12 +111,12 @@ def _load(path: Path) -> list[Picture]:
             )
         if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
             return _video(path)
-        return [_picture(file) for file in files]
+        return [_image(file) for file in files]
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _picture(path: Path) -> Picture:
+def _image(path: Path) -> CalibrationImage:
     content = path.read_bytes()
     if path.suffix.lower() in JPEG_SUFFIXES:
         try:
@@ -126,12 +125,12 @@ def _picture(path: Path) -> Picture:
             raise CalibrationError(f"{path}: {error}; remove it") from error
     else:
         height, width = decode_grey(content, str(path)).shape
-    return Picture(str(path), width, height, hashlib.sha256(content).hexdigest(), content)
+    return CalibrationImage(str(path), width, height, hashlib.sha256(content).hexdigest(), content)
 
 
-def _video(path: Path) -> list[Picture]:
+def _video(path: Path) -> list[CalibrationImage]:
     """The sharpest frame of every piece of a video."""
-    chosen: dict[int, tuple[float, Picture]] = {}
+    chosen: dict[int, tuple[float, CalibrationImage]] = {}
     length_s = VIDEO_PIECE_S
     try:
         with VideoSource(path) as source:
@@ -146,23 +145,25 @@ def _video(path: Path) -> list[Picture]:
                     chosen = _halved(chosen)
     except CaptureError as error:
         raise CalibrationError(str(error)) from error
-    return [picture for _, (_, picture) in sorted(chosen.items(), key=lambda item: item[0])]
+    return [image for _, (_, image) in sorted(chosen.items(), key=lambda item: item[0])]
 
 
-def _halved(chosen: dict[int, tuple[float, Picture]]) -> dict[int, tuple[float, Picture]]:
-    out: dict[int, tuple[float, Picture]] = {}
-    for piece, (score, picture) in chosen.items():
+def _halved(
+    chosen: dict[int, tuple[float, CalibrationImage]],
+) -> dict[int, tuple[float, CalibrationImage]]:
+    out: dict[int, tuple[float, CalibrationImage]] = {}
+    for piece, (score, image) in chosen.items():
         if piece // 2 not in out or score > out[piece // 2][0]:
-            out[piece // 2] = score, picture
+            out[piece // 2] = score, image
     return out
 
 
-def _of_frame(frame: Frame, grey: ImageArray, path: Path) -> Picture:
+def _of_frame(frame: Frame, grey: ImageArray, path: Path) -> CalibrationImage:
     content: bytes | ImageArray = bytes(frame.jpeg) if frame.jpeg is not None else grey
     raw = content if isinstance(content, bytes) else content.tobytes()
     name = f"{path} frame {frame.number}"
     digest = hashlib.sha256(raw).hexdigest()
-    return Picture(name, grey.shape[1], grey.shape[0], digest, content, moving=True)
+    return CalibrationImage(name, grey.shape[1], grey.shape[0], digest, content, moving=True)
 
 
 def frame_grey(frame: Frame, name: str) -> ImageArray:
@@ -174,6 +175,6 @@ def frame_grey(frame: Frame, name: str) -> ImageArray:
 
 def sharpness(grey: ImageArray) -> float:
     """Compares frames of one scene only: the mean square of the Laplacian, larger is sharper."""
-    step = max(1, grey.shape[1] // _JUDGED_WIDTH)
+    step = max(1, grey.shape[1] // _SHARPNESS_WIDTH)
     small = cv2.resize(grey, (grey.shape[1] // step, grey.shape[0] // step), interpolation=3)
     return float(np.square(cv2.Laplacian(small, cv2.CV_32F)).mean())

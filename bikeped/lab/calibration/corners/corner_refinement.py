@@ -1,16 +1,15 @@
-"""Corners to hundredths of a pixel: two blurred edges that cross, fitted to the picture itself.
+"""Corners to hundredths of a pixel: two blurred crossing edges, fitted to the image's pixels.
 
-The gradient method of cv2.cornerSubPix takes edges for straight lines and its window for square; on
-drawn boards that fill a fisheye it is off by 0.038 px where this is by 0.016. Here each
-corner's own neighbours say how the two edges bend and how large a square is along either, the
-window is a share of that square, and position, directions, blur and brightness are fitted to the
-pixels as they are, without interpolation:
+cv2.cornerSubPix assumes straight edges and a square window; on drawn boards that fill a fisheye
+image its error is 0.038 px where this one's is 0.016. Here each corner's neighbours give the bend
+of both edges and the size of a square along them. The window is a share of that square, and
+position, directions, blur and brightness are fitted to the pixels, without interpolation:
 
     I = a0 + a1 u + a2 v + (a3 + a4 u + a5 v) S + a6 S^2
     S = erf(tx / (sqrt2 s)) erf(ty / (sqrt2 s))
 
-with tx, ty the distances in pixels to the two edges and s the blur. The S^2 term is what white that
-bleeds into black looks like. Weak priors keep small squares from being over-fitted.
+with tx, ty the distances in pixels to the two edges and s the blur. The S^2 term models white that
+bleeds into black. Weak priors keep small squares from being over-fitted.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ _SMALL_PX = 6.0  # ... but at least this many pixels, as long as
 _SHARE_MOST = 0.6  # the next edge, smoothed, stays out of the window
 _SAMPLES = 10  # pixels to either side, at most; of wider windows only the edges' surroundings ...
 _ALONG = 14  # ... at this many places to either side
-_BLUR_PX = 0.7  # what a sharp picture has
+_BLUR_PX = 0.7  # of a sharp image
 _STEPS = (3, 5)  # of each pass: the first ends near, the second has its window in the right place
-_DONE_PX = 0.002
+_CONVERGED_PX = 0.002
 # Standard deviations of the priors, in units of the window's contrast where they are grey levels.
 _NOISE = 0.05
 _PRIOR_ANGLE = 0.08
 _PRIOR_BLUR = 0.4  # of its logarithm
 _PRIOR_SLOPE = 0.05
 _PRIOR_BLEED = 0.1
-_STRANGE = np.float32(0.3)  # of half the window's contrast: what the model leaves, at most
+_OUTLIER = np.float32(0.3)  # of half the window's contrast: residuals beyond weigh less
 _ROOT = np.sqrt(2.0)
 
 
@@ -55,41 +54,35 @@ _PRIOR = _priors()
 
 
 @dataclass(frozen=True)
-class Refined:
+class RefinedCorners:
     """Corners [n, 2], and how well each fits.
 
     `blur_px` [n] standard deviation of the edges' smoothing; `contrast` [n] grey levels between
-    dark and light; `residual` [n] root mean square of what the model leaves, over the contrast;
-    `moved_px` [n] from where it started.
+    dark and light; `residual` [n] root mean square residual over the contrast; `shift_px` [n]
+    distance from the start.
     """
 
     uv_px: FloatArray
     blur_px: FloatArray
     contrast: FloatArray
     residual: FloatArray
-    moved_px: FloatArray
+    shift_px: FloatArray
 
 
-def refine(grey: ImageArray, seen: FloatArray, uv_px: FloatArray) -> Refined:
-    """Refines corners `uv_px` [n, 2] at board places `seen` [n, 2] (column, row) on the picture.
+def refine_corners(grey: ImageArray, position: FloatArray, uv_px: FloatArray) -> RefinedCorners:
+    """Refines corners `uv_px` [n, 2] at board positions [n, 2] (column, row) on the image.
 
     They must be within about a pixel and a half, or a fifth of a square, of the truth.
     """
     start, uv = uv_px, uv_px
     blur = _BLUR_PX
     for steps in _STEPS:
-        near = replace(local_map(seen, seen, uv), at_px=uv)
+        near = replace(local_map(position, position, uv), at_px=uv)
         window = _window(grey, near, uv, blur)
         fitted = _fit(window, blur, steps)
-        uv = uv + fitted.shift_px
+        uv = uv + fitted.uv_px
         blur = float(np.clip(np.median(fitted.blur_px), 0.3, 5.0))
-    return Refined(
-        uv,
-        fitted.blur_px,
-        fitted.contrast,
-        fitted.residual,
-        np.linalg.norm(uv - start, axis=1),
-    )
+    return replace(fitted, uv_px=uv, shift_px=np.linalg.norm(uv - start, axis=1))
 
 
 @dataclass(frozen=True)
@@ -104,15 +97,7 @@ class _Window:
     bent: Float32Array  # [n, 2, k] what the bend adds to the distance from either edge, pixels
     across: FloatArray  # [n, 2] direction across either edge, radians
     half_px: FloatArray  # [n] of the whole window
-    inverse_bend: FloatArray  # [n, 2, 3] the same as factors of du^2, du dv, dv^2
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    shift_px: FloatArray
-    blur_px: FloatArray
-    contrast: FloatArray
-    residual: FloatArray
+    bend_factors: FloatArray  # [n, 2, 3] the same as factors of du^2, du dv, dv^2
 
 
 def _window(grey: ImageArray, near: LocalMap, uv: FloatArray, blur_px: float) -> _Window:
@@ -141,7 +126,7 @@ def _window(grey: ImageArray, near: LocalMap, uv: FloatArray, blur_px: float) ->
     bent = bend.astype(np.float32) @ square
     flat = inverse.astype(np.float32) @ np.stack([du, dv], axis=1)
     inside = exists & (np.abs(flat + bent) < share[:, :, None]).all(1)
-    gain = np.maximum(np.linalg.norm(inverse, axis=2), 1e-12)  # squares per pixel across an edge
+    per_px = np.maximum(np.linalg.norm(inverse, axis=2), 1e-12)  # squares per pixel across an edge
 
     low = np.where(inside, value, np.inf).min(1)
     high = np.where(inside, value, -np.inf).max(1)
@@ -154,15 +139,15 @@ def _window(grey: ImageArray, near: LocalMap, uv: FloatArray, blur_px: float) ->
         ((value - ((high + low) / 2)[:, None]) / scale[:, None]).astype(np.float32),
         scale,
         inside.astype(np.float32),
-        bent / gain[:, :, None].astype(np.float32),
+        bent / per_px[:, :, None].astype(np.float32),
         np.arctan2(inverse[:, :, 1], inverse[:, :, 0]),
         np.maximum(half, 1.0),
-        bend / gain[:, :, None],
+        bend / per_px[:, :, None],
     )
 
 
 def _along_edges(near: LocalMap, share: FloatArray, blur_px: float) -> tuple[IntArray, IntArray]:
-    """Columns and rows [n, k] of the pixels about both edges: squares' insides say nothing."""
+    """Columns and rows [n, k] of the pixels about both edges: only these hold information."""
     along = np.linspace(-1, 1, 2 * _ALONG + 1)
     reach = int(np.clip(np.ceil(3 * blur_px + 1.5), 3, 2 * _SAMPLES))
     across = np.arange(-reach, reach + 1) * max(1.0, reach / _SAMPLES)
@@ -200,10 +185,11 @@ def _quadratic_of(bend: FloatArray, linear: FloatArray) -> FloatArray:
     return np.asarray(bend @ mix)
 
 
-def _fit(window: _Window, blur_px: float, steps: int) -> _Fitted:
+def _fit(window: _Window, blur_px: float, steps: int) -> RefinedCorners:
     """Gauss-Newton over all corners at once: directions, offsets, blur, and seven grey terms.
 
-    Pixels in single precision: 48 corners of 500 pixels take a millisecond a step.
+    `uv_px` of the result is from each window's corner. Pixels in single precision: 48 corners of
+    500 pixels take a millisecond a step.
     """
     count, pixels = window.du.shape
     edge = np.zeros((count, 5))
@@ -212,7 +198,7 @@ def _fit(window: _Window, blur_px: float, steps: int) -> _Fitted:
     half = window.half_px[:, None].astype(np.float32)
     u, v = window.du / half, window.dv / half
     grey: FloatArray = np.zeros((count, 7))
-    grey[:, 3] = _first_contrast(window)
+    grey[:, 3] = _contrast_sign(window)
     # Derivatives by the five edge parameters and the seven grey ones: 1 u v S Su Sv S^2.
     columns: Float32Array = np.empty((count, 12, pixels), np.float32)
     basis = columns[:, 5:]
@@ -226,8 +212,8 @@ def _fit(window: _Window, blur_px: float, steps: int) -> _Fitted:
         left = window.level - (factors[:, None] @ basis)[:, 0]
         if step_number == steps:
             break
-        # A finger, a glare or the rim of the image circle in the window counts for little.
-        weight = window.inside / (1 + (left / _STRANGE) ** 2)
+        # Low weight for an occluding object, a glare or the image circle's rim in the window.
+        weight = window.inside / (1 + (left / _OUTLIER) ** 2)
         # d level / d S = a3 + a4 u + a5 v + 2 a6 S
         slope = (factors[:, None, [3, 4, 5]] @ basis[:, :3])[:, 0]
         columns[:, :5] *= (slope + 2 * factors[:, 6, None] * basis[:, 3])[:, None]
@@ -242,16 +228,18 @@ def _fit(window: _Window, blur_px: float, steps: int) -> _Fitted:
         step[:, [1, 3]] = np.clip(step[:, [1, 3]], -1.0, 1.0)
         edge, grey = edge + step[:, :5], grey + step[:, 5:]
         edge[:, 4] = np.clip(edge[:, 4], np.log(0.25), np.log(12.0))
-        if np.quantile(np.abs(step[:, [1, 3]]), 0.98) < _DONE_PX:
+        if np.quantile(np.abs(step[:, [1, 3]]), 0.98) < _CONVERGED_PX:
             break
     swing = np.maximum(np.abs(grey[:, 3]), 1e-3)
-    seen = np.maximum(window.inside.sum(1), 1)
-    residual = np.sqrt((window.inside * left * left).sum(1) / seen) / swing
-    return _Fitted(_meeting(window, edge), np.exp(edge[:, 4]), 2 * swing * window.scale, residual)
+    pixels_used = np.maximum(window.inside.sum(1), 1)
+    residual = np.sqrt((window.inside * left * left).sum(1) / pixels_used) / swing
+    shift = _intersection(window, edge)
+    contrast = 2 * swing * window.scale
+    return RefinedCorners(shift, np.exp(edge[:, 4]), contrast, residual, np.zeros(count))
 
 
-def _first_contrast(window: _Window) -> FloatArray:
-    """[n] which way the colours go, 1 or -1: the sign of the pixels against the crossing's."""
+def _contrast_sign(window: _Window) -> FloatArray:
+    """[n] 1 or -1: whether the pixels' sign is that of the crossing, or its opposite."""
     sign = np.ones_like(window.level)
     for axis in (0, 1):
         across = window.across[:, axis, None]
@@ -285,7 +273,7 @@ def _edges(window: _Window, edge: FloatArray, out: Float32Array) -> None:
     out[:, 8] = profile[0] * profile[1]
 
 
-def _meeting(window: _Window, edge: FloatArray) -> FloatArray:
+def _intersection(window: _Window, edge: FloatArray) -> FloatArray:
     """[n, 2] where the two bent edges cross, pixels from the window's corner."""
     across = np.stack(
         [
@@ -298,12 +286,12 @@ def _meeting(window: _Window, edge: FloatArray) -> FloatArray:
     at: FloatArray = np.zeros((len(edge), 2))
     for _ in range(4):
         square = np.stack([at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=-1)
-        bent = (window.inverse_bend @ square[..., None])[..., 0]
+        bent = (window.bend_factors @ square[..., None])[..., 0]
         at = (inverse @ (edge[:, [1, 3]] - bent)[..., None])[..., 0]
     return at
 
 
-def fits(refined: Refined, spacing_px: FloatArray) -> BoolArray:
-    """[n] which corners are crossings of two edges: contrast, small residual, no far move."""
-    near = refined.moved_px < np.maximum(1.5, 0.25 * spacing_px)
+def is_edge_crossing(refined: RefinedCorners, spacing_px: FloatArray) -> BoolArray:
+    """[n] which corners are crossings of two edges: contrast, small residual, small shift."""
+    near = refined.shift_px < np.maximum(1.5, 0.25 * spacing_px)
     return (refined.residual < 0.35) & (refined.contrast > 12) & near

@@ -203,22 +203,22 @@ def _outermost(
     """The pose at the largest angle up to `theta` at which the whole board is seen."""
     far = np.array([camera.width, camera.height]) - 1 - margin_px
 
-    def fits(angle: float) -> BoardPose | None:
+    def is_edge_crossing(angle: float) -> BoardPose | None:
         pose = _pose_at(pattern, angle, phi, shape)
         uv, seen = true_corners(camera, pattern, pose)
         free = (uv >= margin_px).all() and (uv <= far).all()
         return pose if free and seen.all() else None
 
-    best = fits(theta)
+    best = is_edge_crossing(theta)
     if best is not None:
         return best
     inner, outer = 0.0, theta
-    best = fits(inner)
+    best = is_edge_crossing(inner)
     if best is None:
         return None
     for _ in range(20):
         middle = (inner + outer) / 2
-        pose = fits(middle)
+        pose = is_edge_crossing(middle)
         if pose is None:
             outer = middle
         else:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from synthetic_boards import FLAT, BoardBend, BoardPose, DrawnCamera
 
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.synthetic import FLAT, BoardBend, BoardPose, DrawnCamera
 from bikeped.types import FloatArray, ImageArray
 
 _ROWS_AT_ONCE = 128
@@ -20,8 +20,8 @@ _STEPS = 8  # of the fixed point that finds a bent board along a ray
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a drawn picture looks: grey levels 0 to 255, smoothing and noise.
+class RenderStyle:
+    """How a board image is drawn: grey levels 0 to 255, smoothing and noise.
 
     `margin` is the paper's white border around the outer squares, in squares. `occluded` hides this
     share of the board's width and a third of its height under a dark patch, at a place that `seed`
@@ -40,7 +40,7 @@ class Look:
     samples: int = 4  #: rays along each side of a pixel; more for hundredths of a pixel
 
 
-PLAIN = Look()
+PLAIN = RenderStyle()
 
 
 def draw_picture(
@@ -48,27 +48,27 @@ def draw_picture(
     pattern: BoardPattern,
     pose: BoardPose,
     *,
-    look: Look = PLAIN,
+    style: RenderStyle = PLAIN,
     bend: BoardBend = FLAT,
     seed: int = 0,
 ) -> ImageArray:
     """Grey picture [height, width] of one board; black outside the image circle."""
     rng = np.random.default_rng(seed)
-    picture = _surroundings(camera, look, rng)
-    u0, v0, u1, v1 = _bounds(camera, pattern, pose, bend, look.margin + 1)
-    hidden = _patch(pattern, look, rng)
+    picture = _surroundings(camera, style, rng)
+    u0, v0, u1, v1 = _bounds(camera, pattern, pose, bend, style.margin + 1)
+    hidden = _patch(pattern, style, rng)
     for top in range(v0, v1, _ROWS_AT_ONCE):
         low = min(top + _ROWS_AT_ONCE, v1)
         nodes = _board_positions(camera, pattern, pose, bend, (u0, top, u1, low))
-        board, cover = _pixels(nodes, pattern, look, hidden)
+        board, cover = _pixels(nodes, pattern, style, hidden)
         part = picture[top:low, u0:u1]
         part[...] = part * (1 - cover) + board
     for row in range(camera.height):
         out = _radius(camera, row) / camera.lens.max_radius_px
-        picture[row] *= (out <= 1) * (1 - look.shade * out * out)
-    if look.blur_px > 0:
-        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), look.blur_px), np.float32)
-    picture += np.float32(look.noise) * rng.standard_normal(picture.shape, np.float32)
+        picture[row] *= (out <= 1) * (1 - style.shade * out * out)
+    if style.blur_px > 0:
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), style.blur_px), np.float32)
+    picture += np.float32(style.noise) * rng.standard_normal(picture.shape, np.float32)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
@@ -104,24 +104,24 @@ def _board_positions(
 def _pixels(
     nodes: FloatArray,
     pattern: BoardPattern,
-    look: Look,
+    style: RenderStyle,
     hidden: tuple[float, float, float, float] | None,
 ) -> tuple[FloatArray, FloatArray]:
     """What each pixel [h, w] gets from the board (grey level times cover), and its cover.
 
     A pixel whose corners all lie in one square is that square's; only the others take
-    `look.samples` rays along each side, their board positions bilinear between its corners.
+    `style.samples` rays along each side, their board positions bilinear between its corners.
     """
     corner = np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]])
-    value, covers = _squares(corner, pattern, look, hidden)
+    value, covers = _squares(corner, pattern, style, hidden)
     plain = (value == value[0]).all(0) & (covers == covers[0]).all(0)
     board, cover = value[0] * covers[0], covers[0]
     mixed = corner[:, ~plain]
-    step = (np.arange(look.samples) + 0.5) / look.samples
+    step = (np.arange(style.samples) + 0.5) / style.samples
     x, y = (side.ravel()[:, None, None] for side in np.meshgrid(step, step))
     fine = mixed[0] * (1 - x) * (1 - y) + mixed[1] * x * (1 - y)
     fine += mixed[2] * (1 - x) * y + mixed[3] * x * y
-    value, covers = _squares(fine, pattern, look, hidden)
+    value, covers = _squares(fine, pattern, style, hidden)
     board[~plain] = (value * covers).mean(0)
     cover[~plain] = covers.mean(0)
     return board, cover
@@ -130,7 +130,7 @@ def _pixels(
 def _squares(
     xy: FloatArray,
     pattern: BoardPattern,
-    look: Look,
+    style: RenderStyle,
     hidden: tuple[float, float, float, float] | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Grey levels of board positions, and 1 where there is a board."""
@@ -139,21 +139,21 @@ def _squares(
         column, row = np.floor(x), np.floor(y)
         printed = (column >= 0) & (column <= pattern.columns) & (row >= 0) & (row <= pattern.rows)
         dark = printed & ((column + row) % 2 == 0)
-        m = look.margin
+        m = style.margin
         covers = (x > -m) & (x < pattern.columns + 1 + m) & (y > -m) & (y < pattern.rows + 1 + m)
-        value = np.where(dark, look.black, look.white)
+        value = np.where(dark, style.black, style.white)
         if hidden is not None:
             x0, y0, x1, y1 = hidden
-            value = np.where((x > x0) & (x < x1) & (y > y0) & (y < y1), look.black * 1.5, value)
+            value = np.where((x > x0) & (x < x1) & (y > y0) & (y < y1), style.black * 1.5, value)
     return value, covers.astype(np.float64)
 
 
 def _patch(
-    pattern: BoardPattern, look: Look, rng: np.random.Generator
+    pattern: BoardPattern, style: RenderStyle, rng: np.random.Generator
 ) -> tuple[float, float, float, float] | None:
-    if look.occluded <= 0:
+    if style.occluded <= 0:
         return None
-    wide, high = (pattern.columns + 1) * look.occluded, (pattern.rows + 1) / 3
+    wide, high = (pattern.columns + 1) * style.occluded, (pattern.rows + 1) / 3
     x = rng.uniform(0, pattern.columns + 1 - wide)
     y = rng.uniform(0, pattern.rows + 1 - high)
     return x, y, x + wide, y + high
@@ -176,11 +176,11 @@ def _bounds(
 
 
 def _surroundings(
-    camera: DrawnCamera, look: Look, rng: np.random.Generator
+    camera: DrawnCamera, style: RenderStyle, rng: np.random.Generator
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    coarse = rng.normal(0, look.clutter, (12, 12)).astype(np.float32)
+    coarse = rng.normal(0, style.clutter, (12, 12)).astype(np.float32)
     size = (camera.width, camera.height)
-    out = cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC) + np.float32(look.around)
+    out = cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC) + np.float32(style.around)
     return np.asarray(np.clip(out, 0, 255), np.float32)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bikeped.errors import CalibrationError
-from bikeped.lab.calibration.capture.pictures import load_pictures, pictures_hash, sharpness
+from bikeped.lab.calibration.capture.images import images_hash, load_images, sharpness
 
 
 def write(path: Path, width: int = 64, height: int = 48, seed: int = 0) -> Path:
@@ -24,7 +24,7 @@ def test_files_and_folders_in_natural_order(tmp_path: Path) -> None:
         write(tmp_path / f"{number}.png", seed=number)
     (tmp_path / "notes.txt").write_text("no picture")
     extra = write(tmp_path.parent / f"{tmp_path.name}-extra.jpg", seed=9)
-    pictures = load_pictures([tmp_path, extra])
+    pictures = load_images([tmp_path, extra])
     assert [Path(one.name).name for one in pictures[:3]] == ["1.png", "2.png", "10.png"]
     assert all((one.width, one.height) == (64, 48) for one in pictures)
     assert pictures[3].grey().shape == (48, 64)
@@ -36,10 +36,10 @@ def test_the_hash_is_of_the_bytes_in_order_of_name(tmp_path: Path) -> None:
     expected = hashlib.sha256()
     for path in paths:
         expected.update(hashlib.sha256(path.read_bytes()).digest())
-    assert pictures_hash(load_pictures(paths)) == expected.hexdigest()
-    assert pictures_hash(load_pictures(paths[::-1])) == expected.hexdigest()
+    assert images_hash(load_images(paths)) == expected.hexdigest()
+    assert images_hash(load_images(paths[::-1])) == expected.hexdigest()
     write(paths[1], seed=7)
-    assert pictures_hash(load_pictures(paths)) != expected.hexdigest()
+    assert images_hash(load_images(paths)) != expected.hexdigest()
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
@@ -51,36 +51,36 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         (tmp_path / "none.jpg", "none.jpg: no such file or folder"),
     ):
         with pytest.raises(CalibrationError, match=words):
-            load_pictures([good, path])
+            load_images([good, path])
     text = tmp_path / "text.jpg"
     text.write_text("hello")
     with pytest.raises(CalibrationError, match=r"text\.jpg: .*remove it"):
-        load_pictures([text])
+        load_images([text])
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(CalibrationError, match="holds no pictures"):
-        load_pictures([empty])
+        load_images([empty])
     with pytest.raises(CalibrationError, match="no picture to calibrate from"):
-        load_pictures([])
+        load_images([])
 
 
 def test_a_jpeg_that_ends_in_its_header_is_refused(tmp_path: Path) -> None:
     cut = write(tmp_path / "cut.jpg", 640, 480)
     cut.write_bytes(cut.read_bytes()[:200])
     with pytest.raises(CalibrationError, match=r"cut\.jpg: .*remove it"):
-        load_pictures([cut])
+        load_images([cut])
 
 
 def test_sizes_must_agree(tmp_path: Path) -> None:
     first, other = write(tmp_path / "a.png"), write(tmp_path / "b.jpg", 80, 48)
     with pytest.raises(CalibrationError, match=r"b\.jpg: is 80x48 pixels, but .*a\.png is 64x48"):
-        load_pictures([first, other])
+        load_images([first, other])
 
 
 def test_a_thumbnail_holds_no_board(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "tiny.png"), np.zeros((1, 1), np.uint8))
     with pytest.raises(CalibrationError, match=r"tiny\.png: is 1x1 pixels, too small"):
-        load_pictures([tmp_path / "tiny.png"])
+        load_images([tmp_path / "tiny.png"])
 
 
 def test_a_video_gives_the_sharpest_frame_of_every_half_second(tmp_path: Path) -> None:
@@ -94,14 +94,14 @@ def test_a_video_gives_the_sharpest_frame_of_every_half_second(tmp_path: Path) -
         blur = 0 if number in (2, 8, 11) else 3
         writer.write(np.asarray(cv2.GaussianBlur(sharp, (0, 0), blur), np.uint8) if blur else sharp)
     writer.release()
-    pictures = load_pictures([path])
+    pictures = load_images([path])
     assert [one.name for one in pictures] == [f"{path} frame {n}" for n in (2, 8, 11)]
     assert all(one.moving for one in pictures)
     assert pictures[0].grey().shape == (48, 64)
     damaged = tmp_path / "damaged.mp4"
     damaged.write_bytes(b"\0" * 300)
     with pytest.raises(CalibrationError, match=r"damaged\.mp4"):
-        load_pictures([damaged])
+        load_images([damaged])
 
 
 def test_sharpness_falls_with_blur() -> None:
