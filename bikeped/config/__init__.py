@@ -12,9 +12,10 @@ from bikeped.config.load import (
     LoadedConfig,
     config_hash,
     default_config_path,
-    known_keys,
     load_config,
+    load_decision,
     parse_config,
+    parse_decision,
 )
 from bikeped.config.schema.decision import DecisionConfig, LatencyConfig, TrackingConfig
 from bikeped.config.schema.inputs import CameraConfig, Config, DetectionConfig
@@ -28,6 +29,7 @@ from bikeped.config.schema.outputs import (
     WebConfig,
     is_loopback,
 )
+from bikeped.config.validate import known_keys
 
 __all__ = [
     "AuditConfig",
@@ -53,7 +55,9 @@ __all__ = [
     "known_keys",
     "load_calibration",
     "load_config",
+    "load_decision",
     "parse_config",
+    "parse_decision",
     "road_region",
     "rule_settings",
     "tracker_settings",

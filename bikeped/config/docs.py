@@ -8,12 +8,12 @@ from __future__ import annotations
 import ast
 import inspect
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from bikeped.config.schema.base import sections
 from bikeped.config.schema.inputs import Config
 from bikeped.files import write_whole
 
@@ -47,7 +47,7 @@ at the working directory; `~` is the home directory.
 def json_schema() -> dict[str, Any]:
     """The JSON Schema of config.yaml, every key with its description."""
     schema = msgspec.json.schema(Config)
-    for _, section in _sections(Config, ""):
+    for _, section in sections(Config):
         properties = schema["$defs"][section.__name__]["properties"]
         for key, text in key_descriptions(section).items():
             properties[key]["description"] = text
@@ -69,37 +69,18 @@ def markdown() -> str:
     """The page: one table a section, nested sections after the one that holds them."""
     parts = json_schema()["$defs"]
     lines = [_INTRO]
-    for path, struct in _sections(Config, ""):
-        properties = parts[struct.__name__]["properties"]
-        lines += [f"## {path}", "", " ".join((struct.__doc__ or "").split()), ""]
+    for path, section in sections(Config):
+        keys = key_descriptions(section)
+        if not keys:
+            continue
+        lines += [f"## {path}", "", " ".join((section.__doc__ or "").split()), ""]
         lines += ["| key | values | default | meaning |", "| --- | --- | --- | --- |"]
-        for field in msgspec.structs.fields(struct):
-            if _is_section(field.type):
-                continue
-            item = properties[field.encode_name]
-            row = (
-                f"`{path}.{field.encode_name}`",
-                _values(item),
-                f"`{_yaml(item['default'])}`",
-                item["description"],
-            )
+        for key, text in keys.items():
+            item = parts[section.__name__]["properties"][key]
+            row = (f"`{path}.{key}`", _values(item), f"`{_yaml(item['default'])}`", text)
             lines.append(f"| {' | '.join(map(_escaped, row))} |")
         lines.append("")
     return "\n".join(lines)
-
-
-def _is_section(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
-
-
-def _sections(
-    struct: type[msgspec.Struct], prefix: str
-) -> Iterator[tuple[str, type[msgspec.Struct]]]:
-    for field in msgspec.structs.fields(struct):
-        if _is_section(field.type):
-            path = f"{prefix}{field.encode_name}"
-            yield path, field.type
-            yield from _sections(field.type, f"{path}.")
 
 
 def _escaped(cell: str) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from bikeped.config.load import load_yaml
+from bikeped.config.strict_yaml import load_sections, load_yaml
 from bikeped.errors import ConfigError
 
 
@@ -29,7 +29,7 @@ def set_values(text: str, values: Mapping[str, Mapping[str, Any]], source: str) 
     Raises ConfigError, naming `source` and the section, when that is not possible.
     """
     for section, new in values.items():
-        data = _mapping(text, source)
+        data = load_sections(text, source)
         old = data.get(section)
         if section not in data:
             text = replace_section(text, section, new, source)
@@ -65,22 +65,12 @@ def section_lines(section: str, values: Mapping[str, Any], note: str = "") -> li
 def _checked(before: str, after: str, section: str, values: Mapping[str, Any], source: str) -> str:
     """`after`, if it holds these values in its section and else what `before` holds."""
     with contextlib.suppress(ValueError):
-        if load_yaml(after) == {**_mapping(before, source), section: dict(values)}:
+        if load_yaml(after) == {**load_sections(before, source), section: dict(values)}:
             return after
     raise ConfigError(
         f"{source}: its {section} section cannot be changed without changing the rest, so nothing "
         f"was written; give {section}: lines of its own, one key a line"
     )
-
-
-def _mapping(text: str, source: str) -> dict[str, Any]:
-    try:
-        data = load_yaml(text)
-    except ValueError as error:
-        raise ConfigError(f"{source}: {error}; correct it there") from error
-    if data is not None and not isinstance(data, dict):
-        raise ConfigError(f"{source}: expected sections such as camera: at the top")
-    return data or {}
 
 
 def _yaml() -> YAML:

@@ -10,8 +10,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config import DecisionConfig, parse_config
-from bikeped.config.candidate import parse_decision
+from bikeped.config import DecisionConfig, parse_config, parse_decision
 from bikeped.config.edit import replace_section, section_lines, set_values
 from bikeped.errors import ConfigError
 

@@ -197,9 +197,9 @@ def test_any_values_under_known_keys(values, override):
         ("web: [" + "1," * 20_000 + "]\n", "too many values"),
         (
             "web: {port: 1}\ndecision: {}\nweb: {port: 2}\n",
-            "line 3: is not YAML (web stands twice)",
+            "line 3: is not YAML (web is given twice)",
         ),
-        ("mqtt: {qos: 1, port: 9, qos: 0}\n", "qos stands twice"),
+        ("mqtt: {qos: 1, port: 9, qos: 0}\n", "qos is given twice"),
         ("camera: {calibration: ~nobody_here/x.json}\n", "nobody_here/x.json: cannot be read"),
         ("camera: {calibration: ''}\n", "cannot be read"),
         ("camera:\n", "camera: expected `object`, got `null`"),

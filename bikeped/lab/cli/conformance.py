@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from bikeped.cli.common import progress_bar
 from bikeped.cli.lazy_group import LazyGroup
-from bikeped.config.candidate import load_decision
+from bikeped.config import load_decision
 from bikeped.errors import BikepedError, require
 from bikeped.files import write_whole
 from bikeped.lab.cli.conformance_shared import (

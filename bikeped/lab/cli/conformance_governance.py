@@ -11,7 +11,7 @@ import click
 from rich.markup import escape
 
 from bikeped.cli.common import progress_bar
-from bikeped.config.candidate import load_decision
+from bikeped.config import load_decision
 from bikeped.errors import BikepedError, ConfigError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.cli.conformance_shared import SuiteRun, suite_options

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from bikeped.config.load import load_yaml
+from bikeped.config.strict_yaml import load_yaml
 from bikeped.errors import ScenarioError
 from bikeped.types import BoolArray, FloatArray
 

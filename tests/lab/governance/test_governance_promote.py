@@ -8,8 +8,7 @@ import stat
 import click
 import pytest
 
-from bikeped.config import DecisionConfig, load_config
-from bikeped.config.candidate import parse_decision
+from bikeped.config import DecisionConfig, load_config, parse_decision
 from bikeped.config.provenance import check_provenance, decision_hash
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.lab.cli.conformance import command as conformance

@@ -1,0 +1,145 @@
+"""From the data of a YAML file to a checked Config, and from what is wrong to one line."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
+from bikeped.config.calibration_file import Calibration
+from bikeped.config.schema.base import sections
+from bikeped.config.schema.inputs import Config
+from bikeped.config.schema.outputs import is_loopback
+from bikeped.config.strict_yaml import one_line
+from bikeped.errors import ConfigError
+
+
+def to_config(data: dict[str, Any], source: str) -> Config:
+    """The configuration that `data` holds; ConfigError names `source`, the key and the remedy."""
+    try:
+        config = msgspec.convert(data, Config, strict=True)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(error, data)}") from error
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise ConfigError(f"{source}: {error}; see bikeped config schema") from error
+    decision = config.decision
+    if decision.d_min_m > decision.d_max_m:
+        raise ConfigError(
+            f"{source}: decision.d_min_m: {decision.d_min_m:g} is above decision.d_max_m "
+            f"{decision.d_max_m:g}; exchange them"
+        )
+    return config
+
+
+def check_together(config: Config, source: str) -> None:
+    """Checks keys that depend on one another; ConfigError as `to_config`."""
+    camera, mqtt, web = config.camera, config.mqtt, config.web
+    if camera.calibration is None and (camera.radius_px is None) != (camera.fov_deg is None):
+        raise ConfigError(
+            f"{source}: camera.radius_px and camera.fov_deg: without a calibration both are "
+            "needed, for they give the focal length; set both"
+        )
+    if camera.calibration is None and camera.radius_px is None:
+        raise ConfigError(
+            f"{source}: camera.calibration: missing; name a calibration file, or set "
+            "camera.radius_px and camera.fov_deg"
+        )
+    if (mqtt.cert_file is None) != (mqtt.key_file is None):
+        raise ConfigError(
+            f"{source}: mqtt.cert_file and mqtt.key_file: one without the other; set both"
+        )
+    if web.enabled and web.token_file is None and not is_loopback(web.host):
+        raise ConfigError(
+            f"{source}: web.host: {one_line(web.host)} can be reached by others, who would see the "
+            "camera's picture; set web.token_file too, or web.host: 127.0.0.1"
+        )
+
+
+def check_calibration(config: Config, calibration: Calibration, file: str) -> None:
+    """Checks that a calibration was made with the configured framing; ConfigError names `file`."""
+    camera = config.camera
+    for key, measured, configured in (
+        ("crop_size", calibration.crop_size, camera.crop_size),
+        ("pad_size", calibration.pad_size, camera.pad_size),
+        ("width", calibration.frame_width, camera.width),
+        ("height", calibration.frame_height, camera.height),
+    ):
+        if measured is not None and measured != configured:
+            raise ConfigError(
+                f"{file}: does not fit: camera.{key} is {configured}, the calibration was made "
+                f"with {measured}; set camera.{key}: {measured} or calibrate again"
+            )
+    if camera.crop_size is not None and not (
+        0 <= calibration.cx <= camera.crop_size and 0 <= calibration.cy <= camera.crop_size
+    ):
+        raise ConfigError(
+            f"{file}: does not fit: centre ({calibration.cx:g}, {calibration.cy:g}) lies outside "
+            f"the crop of {camera.crop_size} px; calibrate again with this crop"
+        )
+
+
+def known_keys() -> Iterator[str]:
+    """Every key as `section.key`, a nested section's after those of the section that holds it."""
+    for path, section in sections(Config):
+        inner = {name for name, _ in sections(Config)}
+        for field in msgspec.structs.fields(section):
+            name = f"{path}.{field.name}" if path else field.name
+            if name not in inner:
+                yield name
+
+
+def _explain(error: msgspec.ValidationError, data: dict[str, Any]) -> str:
+    """msgspec's message as the key, what is wrong, and the remedy."""
+    body, _, path = str(error).partition(" - at `")
+    path = path.rstrip("`").removeprefix("$").removeprefix(".")
+    unknown = re.match(r"Object contains unknown field `(.*)`$", body, re.DOTALL)
+    if unknown:
+        return _explain_unknown(path, unknown.group(1))
+    if path.startswith("key` in"):
+        section = path.removeprefix("key` in `$").removeprefix(".") or "top level"
+        return f"{one_line(section)}: a key is not text; keys are words such as camera"
+    value: Any = data
+    for part in path.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    try:
+        got = "" if value is None else f" (got {one_line(repr(value))})"
+    except ValueError:  # a whole number of thousands of digits
+        got = " (got a huge number)"
+    remedy = _allowed(path) or "see bikeped config schema"
+    label = one_line(path) or "top level"
+    return f"{label}: {one_line(body[:1].lower() + body[1:])}{got}; {remedy}"
+
+
+def _explain_unknown(section: str, name: str) -> str:
+    """The nearest known key of the section, a key of that name elsewhere, or all of the section."""
+    struct = dict(sections(Config)).get(section)
+    names = [] if struct is None else [field.name for field in msgspec.structs.fields(struct)]
+    elsewhere = [key for key in known_keys() if key.split(".")[-1] == name]
+    near = [*difflib.get_close_matches(name, names, 1, 0.5), *elsewhere]
+    remedy = f"did you mean {near[0]}?" if near else f"known here: {', '.join(names)}"
+    return f"{one_line(f'{section}.{name}' if section else name)}: unknown key; {remedy}"
+
+
+def _allowed(key: str) -> str:
+    """The values that a key takes, in words; empty where the schema has no short answer."""
+    path, item, _ = key.partition("[")
+    section, _, name = path.rpartition(".")
+    struct = dict(sections(Config)).get(section)
+    if struct is None:
+        return ""
+    properties = msgspec.json.schema(Config)["$defs"][struct.__name__]["properties"]
+    node = properties.get(name, {})
+    choices = [node["items"]] if item and "items" in node else [node, *node.get("anyOf", ())]
+    names = [str(n) for choice in choices for n in choice.get("enum", ()) if n is not None]
+    if names:
+        return f"use one of {', '.join(names)}"
+    for choice in choices:
+        low = choice.get("minimum", choice.get("exclusiveMinimum"))
+        high = choice.get("maximum")
+        if low is not None and high is not None:
+            above = "above " if "exclusiveMinimum" in choice else ""
+            return f"use a value {above}{low:g} to {high:g}"
+    return ""
