@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,20 +15,38 @@ from bikeped.cli.common import FiniteRange, config_options, console, json_option
 from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.errors import BikepedError, require
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.cli.calibrate_options import CalibrateOptions, PatternType
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 _MODELS = ("equidistant", "equisolid", "stereographic", "orthographic", "linear", "equalarea")
 _DEFAULT_OUT = Path("camera_calibration.json")
+#: A board needs corners in two directions, and no printed one has more.
+_FEWEST, _MOST = 3, 60
+
+
+def _pattern(_ctx: click.Context, _param: click.Parameter, text: str | None) -> BoardPattern:
+    """Inner corners as COLUMNSxROWS."""
+    if text is None:
+        raise BikepedError(
+            "--pattern: missing; count the corners where four squares meet and give COLUMNSxROWS, "
+            "e.g. --pattern 8x6"
+        )
+    match = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", text.strip())
+    sides = (0, 0) if match is None else (int(match[1]), int(match[2]))
+    if not all(_FEWEST <= side <= _MOST for side in sides):
+        raise click.BadParameter(
+            f"{text!r} is no board: give the inner corners as COLUMNSxROWS, e.g. 8x6, each from "
+            f"{_FEWEST} to {_MOST}"
+        )
+    return BoardPattern(*sides)
 
 
 @click.command("calibrate")
 @click.argument("images", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
     "--pattern",
-    type=PatternType(),
+    callback=_pattern,
     metavar="COLUMNSxROWS",
     help="Inner corners of the board, where four squares meet, e.g. 8x6.",
 )
@@ -92,7 +112,7 @@ _DEFAULT_OUT = Path("camera_calibration.json")
 @guarded
 def command(
     images: tuple[Path, ...],
-    pattern: tuple[int, int] | None,
+    pattern: BoardPattern,
     square_m: float | None,
     model: str | None,
     terms: str | None,
@@ -113,12 +133,7 @@ def command(
     Sensor frames (camera.width x camera.height) are calibrated in the square crop that the
     configuration describes, pictures of any other size as they are.
     """
-    if pattern is None:
-        raise BikepedError(
-            "--pattern: missing; count the corners where four squares meet and give COLUMNSxROWS, "
-            "e.g. --pattern 8x6"
-        )
-    board = BoardPattern(*pattern, square_m or 1.0)
+    board = replace(pattern, square_m=square_m or 1.0)
     screen = console(json_path)
     if board_path is not None:
         _write_board(board_path, board, page, screen)
@@ -132,7 +147,13 @@ def command(
         require("matplotlib", extra="calibrate")
     _check_outputs(images, config_path, out or _DEFAULT_OUT, report_path, json_path)
     from bikeped.lab.cli.calibrate_capture import live_pictures
-    from bikeped.lab.cli.calibrate_run import camera_config, images_of, run, write_outputs
+    from bikeped.lab.cli.calibrate_run import (
+        CalibrateOptions,
+        camera_config,
+        images_of,
+        run,
+        write_outputs,
+    )
     from bikeped.lab.cli.calibrate_tables import print_result
 
     number = None if terms is None else int(terms)

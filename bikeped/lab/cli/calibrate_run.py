@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from bikeped.cli.common import progress_bar, write_json
@@ -11,6 +12,7 @@ from bikeped.config import LoadedConfig, framing, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 from bikeped.geometry import canonical_projection
+from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.capture.coverage import measure_coverage
 from bikeped.lab.calibration.capture.images import CalibrationImage, load_images
 from bikeped.lab.calibration.image_pipeline import detect_boards
@@ -32,9 +34,26 @@ from bikeped.lab.calibration.solver.model_comparison import (
     recommend_model,
 )
 from bikeped.lab.calibration.solver.observations import prepare_observations
-from bikeped.lab.cli.calibrate_options import CalibrateOptions
 
 _CIRCLE_IMAGES = 16  # enough to see the image circle
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Board and models; `model` and `terms` None: as `--compare` recommends, or the defaults."""
+
+    pattern: BoardPattern
+    model: str | None
+    terms: int | None
+    board_shape: bool
+    compare: bool
+    folds: int  #: 0: each image is a fold
+
+    @property
+    def writes_recommended(self) -> bool:
+        """Whether the recommended model is written."""
+        open_model = self.model is None and self.terms is None and not self.board_shape
+        return self.compare and open_model
 
 
 def run(

@@ -10,7 +10,6 @@ from bikeped.geometry import Lens
 from bikeped.geometry.lens import unit_radius
 from bikeped.lab.calibration.solver.bundle_adjustment import (
     AdjustmentResult,
-    AdjustmentStage,
     ShapePrior,
     adjust,
 )
@@ -29,14 +28,10 @@ from bikeped.types import FloatArray
 
 
 @dataclass(frozen=True)
-class LensFit:
-    """A model's best state and its errors. Arrays are [V, C, ...] as in the observations."""
+class LensFit(AdjustmentResult):
+    """An adjustment with its cross-validation and uncertainty; arrays [V, C, ...]."""
 
-    model: LensModel
-    state: CalibrationState
-    stages: tuple[AdjustmentStage, ...]
     observations: CornerObservations
-    residuals_px: FloatArray
     #: Residuals of each image when it was held out; None: not cross-validated.
     held_out_px: FloatArray | None
     covariance: FloatArray  #: of the lens's parameters, in the model's order
@@ -125,14 +120,9 @@ def fit_lens(
     """
     adjusted = adjust(observations, model, start)
     held_out = held_out_residuals(adjusted, observations, folds) if folds is not None else None
+    covariance = _covariance(adjusted, observations)
     return LensFit(
-        model,
-        adjusted.state,
-        adjusted.stages,
-        observations,
-        adjusted.residuals_px,
-        held_out,
-        _covariance(adjusted, observations),
+        **vars(adjusted), observations=observations, held_out_px=held_out, covariance=covariance
     )
 
 

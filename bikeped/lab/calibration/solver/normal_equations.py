@@ -7,6 +7,7 @@ poses (the Schur complement) leaves a matrix as small as the lens has parameters
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -81,14 +82,12 @@ class NormalEquations:
         flat_strip = self.strip.reshape(-1, len(self.shared))
         reduced = self.shared - flat_strip.T @ solved.reshape(flat_strip.shape)
         scale = np.sqrt(np.maximum(np.diagonal(reduced), 1e-300))
-        try:
+        with contextlib.suppress(np.linalg.LinAlgError):
             part = np.linalg.solve(reduced / np.outer(scale, scale), np.eye(len(scale), size))
-        except np.linalg.LinAlgError:
-            return np.full((size, size), np.inf)
-        part = part[:size] / np.outer(scale[:size], scale[:size])
-        if not (np.diagonal(part) > 0).all():
-            return np.full((size, size), np.inf)
-        return np.asarray(part)
+            part = part[:size] / np.outer(scale[:size], scale[:size])
+            if (np.diagonal(part) > 0).all():
+                return np.asarray(part)
+        return np.full((size, size), np.inf)
 
     @property
     def slope_size(self) -> float:
