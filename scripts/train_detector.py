@@ -5,8 +5,9 @@
     scripts/train-detector --out DIR --experiment rectilinear against fisheye-augmented training
     scripts/train-detector --measure              measures the package's model again, on pictures as
                                                   they are drawn now, and writes its card
+    scripts/train-detector --card                 writes the card's text from its figures
 
-A step whose result is in DIR already is passed over; remove it to do it again.
+A step whose result is in DIR already is skipped; remove it to do it again.
 """
 
 from __future__ import annotations
@@ -93,10 +94,11 @@ def main() -> int:
     parser.add_argument("--pictures", type=int, default=PICTURES)
     parser.add_argument("--ship", action="store_true", help="copy model and card into the package")
     parser.add_argument("--experiment", action="store_true")
-    parser.add_argument("--measure", action="store_true", help="the package's model, again")
+    parser.add_argument("--measure", action="store_true", help="measure the package's model again")
+    parser.add_argument("--card", action="store_true", help="write the card's text from its figures")
     options = parser.parse_args()
-    if options.measure:
-        measure_again()
+    if options.measure or options.card:
+        write_card(measure=options.measure)
         return 0
     if options.out is None:
         parser.error("--out: name the folder for everything")
@@ -213,12 +215,14 @@ def measured(folder: Path, loaded: LoadedConfig) -> dict[str, Any]:
     return sections
 
 
-def measure_again() -> None:
-    """Tests the model that is in the package and writes its card; the model stays as it is."""
+def write_card(measure: bool) -> None:
+    """Writes the card of the package's model, its figures measured again or as they are."""
     folder = BUNDLED_FILE.parent
-    card = read(folder / "small.json") | measured(folder, load_config(None))
-    card["made"]["measured"] = commit()
-    write_json(folder / "small.json", card)
+    card = read(folder / "small.json")
+    if measure:
+        card |= measured(folder, load_config(None))
+        card["made"]["measured"] = commit()
+        write_json(folder / "small.json", card)
     write_whole(folder / "small.md", render_card(card))
     say(f"wrote {folder / 'small.json'}, small.md")
 

@@ -14,7 +14,7 @@ from bikeped.detection import load_detector
 from bikeped.detection.model_hash import sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
-from bikeped.lab.training.model_card_text import meets_target
+from bikeped.lab.training.model_card_text import meets_target, render_card
 from bikeped.models import (
     BUNDLED,
     BUNDLED_FILE,
@@ -56,6 +56,7 @@ def test_the_card_is_this_files(card):
     assert BUNDLED_FILE.stat().st_size + BUNDLED_INT8_FILE.stat().st_size <= 4_000_000
     text = BUNDLED_FILE.with_suffix(".md").read_text()
     assert "must not be used for a street" in text
+    assert text == render_card(card), "scripts/train-detector --card writes it anew"
 
 
 def test_the_card_says_whether_its_aim_is_reached(card):
