@@ -95,7 +95,7 @@ def main() -> int:
     parser.add_argument("--ship", action="store_true", help="copy model and card into the package")
     parser.add_argument("--experiment", action="store_true")
     parser.add_argument("--measure", action="store_true", help="measure the package's model again")
-    parser.add_argument("--card", action="store_true", help="write the card's text from its figures")
+    parser.add_argument("--card", action="store_true", help="write the card from its figures")
     options = parser.parse_args()
     if options.measure or options.card:
         write_card(measure=options.measure)

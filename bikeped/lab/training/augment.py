@@ -1,7 +1,7 @@
-"""Fisheye augmentation: a data set of ordinary pictures becomes one of fisheye pictures.
+"""Fisheye augmentation: warps a data set of ordinary pictures into fisheye pictures.
 
-What one picture becomes depends on the seed, its id and the number of the copy alone, never on the
-order or on who works on it. The new data set appears whole or not at all.
+Each result depends only on the seed, the picture's id and the number of the copy, not on order or
+processes. The new data set appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import concurrent.futures
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -33,13 +33,12 @@ from bikeped.lab.training.coco import (
 from bikeped.lab.training.warp import Warp, WarpRanges, sample_warp, warp_boxes, warp_picture
 from bikeped.types import BoolArray, FloatArray, ImageArray
 
-#: An object of which less than this share of its area is left is dropped,
-LEAST_SHARE = 0.3
-#: and so is one whose box is narrower or lower than this, in pixels of the new picture.
-LEAST_SIDE_PX = 3.0
+#: An object is dropped when less than this share of its area is left, or a side of its box is
+#: shorter than this in the new picture.
+LEAST_SHARE, LEAST_SIDE_PX = 0.3, 3.0
 JPEG_QUALITY = 95
-_BATCH = 8  # pictures a job: few enough that both processes end at the same time
-_SMALL = 8  # below this many pictures, starting processes takes longer than the work
+_BATCH = 8  # pictures a job: few enough that all processes end at about the same time
+_SMALL = 8  # with fewer pictures, starting processes takes longer than the work
 
 
 @dataclass(frozen=True)
@@ -61,27 +60,20 @@ class AugmentSettings:
 
 @dataclass(frozen=True)
 class AugmentSummary:
-    """What an augmentation made."""
+    """Counts of an augmentation."""
 
     folder: Path
     pictures: int
     objects: int
     dropped: int  #: objects of which too little was left
-    empty: int  #: boxes of the source without area, passed over
+    empty: int  #: boxes of the source without area, left out
     by_category: Mapping[str, int]
     seed: int
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "folder": str(self.folder),
-            "pictures": self.pictures,
-            "objects": self.objects,
-            "dropped": self.dropped,
-            "boxes_without_area": self.empty,
-            "by_category": dict(self.by_category),
-            "seed": self.seed,
-        }
+        body = asdict(self)
+        return body | {"folder": str(self.folder), "boxes_without_area": body.pop("empty")}
 
 
 def augment_picture(
@@ -96,36 +88,13 @@ def augment_picture(
 ) -> tuple[ImageArray, FloatArray, BoolArray]:
     """A picture [h, w, 3] and its boxes [n, 4] (x1, y1, x2, y2) through one lens.
 
-    Gives the new picture [size, size, 3], the boxes [n, 4] in it and which of them are kept [n]:
-    at least `least_share` of the object's area is still seen and its box measures `least_side_px`
-    each way. A crowd region is kept while anything of it is left, for it says where not to judge.
+    Returns the new picture [size, size, 3], the boxes [n, 4] in it and which of them are kept [n]:
+    at least `least_share` of the object's area is visible and its box measures `least_side_px` each
+    way. A crowd region is kept while anything of it is visible, for its area is not evaluated.
     Boxes that are not kept may be NaN. Pure.
     """
     high, wide = image.shape[:2]
-    boxes, kept = augment_boxes(
-        box_px,
-        (wide, high),
-        warp,
-        polygons=polygons,
-        crowd=crowd,
-        least_share=least_share,
-        least_side_px=least_side_px,
-    )
-    return warp_picture(image, warp), boxes, kept
-
-
-def augment_boxes(
-    box_px: npt.ArrayLike,
-    picture_wh: tuple[int, int],
-    warp: Warp,
-    *,
-    polygons: Sequence[Sequence[FloatArray]] | None = None,
-    crowd: npt.ArrayLike | None = None,
-    least_share: float = LEAST_SHARE,
-    least_side_px: float = LEAST_SIDE_PX,
-) -> tuple[FloatArray, BoolArray]:
-    """The boxes' part of `augment_picture`."""
-    boxes, share = warp_boxes(warp, picture_wh, box_px, polygons)
+    boxes, share = warp_boxes(warp, (wide, high), box_px, polygons)
     many: BoolArray = np.zeros(len(boxes), np.bool_)
     if crowd is not None:
         many |= np.asarray(crowd, np.bool_)
@@ -133,11 +102,11 @@ def augment_boxes(
     with np.errstate(invalid="ignore"):
         kept = (side >= least_side_px) & (share >= least_share)
         kept |= many & (side > 0)
-    return boxes, kept
+    return warp_picture(image, warp), boxes, kept
 
 
 def picture_generator(seed: int, image_id: int, copy: int) -> np.random.Generator:
-    """Random numbers of one copy of one picture, whatever the order and whoever works on it."""
+    """Random numbers of one copy of one picture, independent of the order of work."""
     return np.random.default_rng([seed, image_id, copy])
 
 
@@ -149,8 +118,8 @@ def augment_data(
 ) -> AugmentSummary:
     """Writes the augmented data set to the new folder `out`: `annotations.json` and `images/`.
 
-    A picture that cannot be read ends it with a DataSetError, and then there is no `out`. The
-    source's licences, info and entries are carried along; every picture tells its lens.
+    The source's licences, info and entries are kept; every picture records its lens. Raises
+    DataSetError, and leaves no `out`, where a picture cannot be read.
     """
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -176,7 +145,7 @@ _Made = tuple[list[dict[str, Any]], list[dict[str, Any]], int]
 
 
 def _results(data: CocoData, folder: Path, settings: AugmentSettings) -> Iterator[_Made]:
-    """What every source picture became, in any order."""
+    """The results of all source pictures, in any order."""
     jobs = [(image, data.objects[image.id]) for image in data.images]
     if settings.processes == 1 or len(jobs) * settings.copies <= _SMALL:
         for job in jobs:
@@ -184,7 +153,7 @@ def _results(data: CocoData, folder: Path, settings: AugmentSettings) -> Iterato
         return
     batches = iter([jobs[at : at + _BATCH] for at in range(0, len(jobs), _BATCH)])
     with worker_pool(settings.processes) as pool:
-        # A few batches ahead: a hundred thousand waiting results would be memory for nothing.
+        # Only a few batches ahead, to bound the memory of waiting results.
         ahead = {
             pool.submit(_batch, batch, folder, settings)
             for batch in islice(batches, 3 * settings.processes)
@@ -214,7 +183,7 @@ def _copies(
     standing = furniture(image)
     entries: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
-    lost = 0
+    lost, count = 0, len(objects)
     for copy in range(settings.copies):
         warp = sample_warp(picture_generator(settings.seed, image.id, copy), settings.ranges)
         drawn, every_box, every_kept = augment_picture(
@@ -225,20 +194,12 @@ def _copies(
             crowd=[*(thing.crowd for thing in objects), *(False for _ in standing)],
             least_share=settings.least_share,
         )
-        boxes, kept = every_box[: len(objects)], every_kept[: len(objects)]
+        boxes, kept = every_box[:count], every_kept[:count]
         name = f"{image.id:012d}_{copy}.jpg"
         _write_jpeg(folder / name, drawn)
         new_id = image.id * settings.copies + copy
-        things = [
-            {"what": what, "bbox": _bbox(box)}
-            for (what, _), box, keep in zip(
-                standing,
-                every_box[len(objects) :].tolist(),
-                every_kept[len(objects) :].tolist(),
-                strict=True,
-            )
-            if keep
-        ]
+        rest = zip(standing, every_box[count:].tolist(), every_kept[count:], strict=True)
+        things = [{"what": what, "bbox": _bbox(box)} for (what, _), box, keep in rest if keep]
         entries.append(
             {
                 **image.entry,
@@ -262,20 +223,20 @@ def _copies(
 def _annotation(
     thing: CocoObject, box: Sequence[float], image_id: int, copy: int, copies: int
 ) -> dict[str, Any]:
-    x, y, wide, high = _bbox(box)
+    bbox = _bbox(box)
     return {
         "id": thing.id * copies + copy,
         "image_id": image_id,
         "category_id": thing.category_id,
-        "bbox": [x, y, wide, high],
-        "area": round(wide * high, 3),
+        "bbox": bbox,
+        "area": round(bbox[2] * bbox[3], 3),
         "iscrowd": int(thing.crowd),
     }
 
 
 def _bbox(box: Sequence[float]) -> list[float]:
     """COCO's x, y, width, height of x1, y1, x2, y2."""
-    # Three decimals: far below what anyone can mark, and no rounding noise in the file.
+    # Three decimals are far finer than a mark by hand.
     x1, y1, x2, y2 = (round(value, 3) for value in box)
     return [x1, y1, round(x2 - x1, 3), round(y2 - y1, 3)]
 
@@ -309,7 +270,7 @@ def _write_jpeg(path: Path, picture: ImageArray) -> None:
 
 @contextmanager
 def _whole_folder(data: CocoData, out: Path) -> Iterator[Path]:
-    """A folder beside `out` that becomes `out` when all went well, and else disappears."""
+    """A folder beside `out` that is renamed to `out` after success, else removed."""
     target = out.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise DataSetError(f"--out {out}: exists already; name a new folder")

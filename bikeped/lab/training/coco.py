@@ -1,8 +1,8 @@
-"""Reading and writing data sets in COCO's format, strictly.
+"""Data sets in COCO's format, read strictly.
 
 The format: cocodataset.org, "Data format", object detection. Boxes are [x, y, width, height] in
-pixels, counted from the picture's upper left corner (not from the middle of its first pixel).
-What bikeped does not use (licences, addresses, dates) is carried along untouched.
+pixels from the picture's upper left corner (not from the middle of its first pixel). Entries that
+bikeped does not use (licences, addresses, dates) are kept.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from bikeped.types import FloatArray, ImageArray
 
 _JPEG = b"\xff\xd8"
 _LARGEST_SIDE = 32768
-#: Among the furniture of an image: false detections of a network (`hard_negative_mining`).
+#: `what` of an image's furniture that is a false positive of a network (`hard_negative_mining`).
 FALSE_POSITIVE = "mistaken"
 Box = tuple[float, float, float, float]  #: x1, y1, x2, y2 in pixels of a picture
 
 
 @dataclass(frozen=True)
 class CocoImage:
-    """One picture: `file_name` as the data set has it, `path` where it lies, size in pixels.
+    """One picture: `file_name` in the data set, `path` on the disk, size in pixels.
 
-    `entry` is the whole entry of the data set's `images`, licence and address included.
+    `entry` is its whole entry in the data set's `images`.
     """
 
     id: int
@@ -49,18 +49,17 @@ class CocoImage:
 
 @dataclass(frozen=True)
 class CocoObject:
-    """One annotation: `box_px` x1, y1, x2, y2, within the picture; `crowd` stands for many.
+    """One annotation: `box_px` within the picture; a `crowd` is a region of many objects.
 
     `polygons` are the outlines [n, 2] of its segmentation in picture pixels, empty where it has
-    none or a run-length mask. `distance_m` from the camera's foot and `visible`, the share of it
-    that is neither hidden nor outside the picture, are bikeped's own additions: drawn pictures
-    have them.
+    none or a run-length mask. `distance_m` from the camera's foot and `visible`, the share that is
+    neither hidden nor outside the picture, are bikeped's additions in drawn pictures.
     """
 
     id: int
     image_id: int
     category_id: int
-    box_px: tuple[float, float, float, float]
+    box_px: Box
     crowd: bool = False
     polygons: tuple[FloatArray, ...] = field(repr=False, default=(), compare=False)
     distance_m: float | None = None
@@ -71,15 +70,15 @@ class CocoObject:
 class CocoData:
     """A data set: pictures and objects by rising id, categories by id.
 
-    `objects` maps every picture's id to what is in it; `empty` counts boxes that had no area inside
-    their picture and were passed over. `sha256` is of the annotation file.
+    `objects`: by picture id; `empty`: number of boxes left out, without area within their picture;
+    `sha256`: of the annotation file.
     """
 
     source: Path
     images: tuple[CocoImage, ...]
     objects: Mapping[int, tuple[CocoObject, ...]]
     categories: Mapping[int, str]
-    header: Mapping[str, Any]  #: every other part of the file: info, licenses, categories as given
+    header: Mapping[str, Any]  #: the rest of the file: info, licenses, categories as given
     empty: int
     sha256: str
 
@@ -100,7 +99,7 @@ class _Annotation(msgspec.Struct):
     id: int
     image_id: int
     category_id: int
-    bbox: tuple[float, float, float, float]
+    bbox: Box
     iscrowd: int | bool = 0
     segmentation: Any = None
     distance_m: float | None = None
@@ -123,8 +122,8 @@ def read_coco(data: Path, images_dir: Path | None = None) -> CocoData:
 
     A folder holds `annotations.json`, or COCO's own layout: `annotations/instances_NAME.json` with
     the pictures in `NAME/` (`images/NAME/` is found, too). Otherwise `images_dir` names the folder
-    that `file_name` starts from. Every picture must be there. Raises DataSetError naming file, key
-    and mend.
+    that `file_name` starts from. Every picture must exist. Raises DataSetError that names file, key
+    and remedy.
     """
     source = _annotation_file(data)
     try:
@@ -135,9 +134,8 @@ def read_coco(data: Path, images_dir: Path | None = None) -> CocoData:
         raw = msgspec.json.decode(content)
         file = msgspec.convert(raw, _File)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:  # ValidationError is one of these
-        reason = str(error)
         raise DataSetError(
-            f"{source}: is not COCO's object detection format: {reason}; correct it there"
+            f"{source}: is not COCO's object detection format: {error}; correct it there"
         ) from error
     except RecursionError as error:
         raise DataSetError(f"{source}: is nested too deeply to be COCO's format") from error
@@ -155,10 +153,10 @@ def read_coco(data: Path, images_dir: Path | None = None) -> CocoData:
         CocoImage(i.id, i.file_name, i.width, i.height, root / i.file_name, entry)
         for i, entry in zip(file.images, raw["images"], strict=True)
     ]
-    for there in images:
-        if not there.path.is_file():
+    for picture in images:
+        if not picture.path.is_file():
             raise DataSetError(
-                f"{there.path}: is missing, but {source} names it (image {there.id}); add the "
+                f"{picture.path}: is missing, but {source} names it (image {picture.id}); add the "
                 "picture or remove the entry"
             )
     objects, empty = _objects(source, file, {i.id: i for i in images})
@@ -174,19 +172,18 @@ def read_coco(data: Path, images_dir: Path | None = None) -> CocoData:
 
 
 def furniture(image: CocoImage) -> list[tuple[str, Box]]:
-    """What stands in a drawn picture and is nobody, and its box within the picture.
+    """Fixtures, shadows and false positives of a picture: what each is, and its box within it.
 
-    bikeped's own addition to an image's entry (`lab.rendering`): `furniture`, a list of `what` and
+    bikeped's addition to an image's entry (`lab.rendering`): `furniture`, a list of `what` and
     `bbox`, which may reach beyond the picture. Raises DataSetError where it is no such list.
     """
     found: list[tuple[str, Box]] = []
     try:
         for thing in image.entry.get("furniture", ()):
-            x, y, wide, high = (float(side) for side in thing["bbox"])
-            x1, y1 = max(x, 0.0), max(y, 0.0)
-            x2, y2 = min(x + wide, float(image.width)), min(y + high, float(image.height))
-            if x2 - x1 >= 1 and y2 - y1 >= 1:
-                found.append((str(thing["what"]), (x1, y1, x2, y2)))
+            x, y, width, height = (float(side) for side in thing["bbox"])
+            box = _clipped(image, x, y, width, height)
+            if box[2] - box[0] >= 1 and box[3] - box[1] >= 1:
+                found.append((str(thing["what"]), box))
     except (KeyError, TypeError, ValueError) as error:
         raise DataSetError(
             f"{image.path}: its `furniture` (image {image.id}) is no list of what and bbox; "
@@ -196,18 +193,13 @@ def furniture(image: CocoImage) -> list[tuple[str, Box]]:
 
 
 def read_picture(image: CocoImage) -> ImageArray:
-    """The picture, RGB [height, width, 3] uint8, turned by no EXIF tag, as COCO's boxes are.
+    """The picture, RGB [height, width, 3] uint8; EXIF orientation is ignored, as COCO's boxes do.
 
-    Raises DataSetError for a file that is no whole picture or not of the size that the data says.
+    Raises DataSetError for a file that is no whole picture or not of the recorded size.
     """
     try:
         content = image.path.read_bytes()
-        size = _header_size(content)
-        if size is not None and size != (image.width, image.height):
-            raise DataSetError(
-                f"{image.path}: is {size[0]} x {size[1]} pixels, but the data say {image.width} x "
-                f"{image.height} (image {image.id}); correct width and height"
-            )
+        _check_size(image, _header_size(content))  # before memory is taken for it
         picture = _decode(content)
     except OSError as error:
         raise DataSetError(f"{image.path}: cannot be read ({error.strerror})") from error
@@ -217,12 +209,16 @@ def read_picture(image: CocoImage) -> ImageArray:
             f"{image.path}: is no whole picture ({why}); replace it, or remove image {image.id} "
             "from the data"
         ) from error
-    if picture.shape[:2] != (image.height, image.width):
-        raise DataSetError(
-            f"{image.path}: is {picture.shape[1]} x {picture.shape[0]} pixels, but the data say "
-            f"{image.width} x {image.height} (image {image.id}); correct width and height"
-        )
+    _check_size(image, (picture.shape[1], picture.shape[0]))
     return picture
+
+
+def _check_size(image: CocoImage, size: tuple[int, int] | None) -> None:
+    if size is not None and size != (image.width, image.height):
+        raise DataSetError(
+            f"{image.path}: is {size[0]} x {size[1]} pixels, but the data say {image.width} x "
+            f"{image.height} (image {image.id}); correct width and height"
+        )
 
 
 def write_annotations(
@@ -319,36 +315,30 @@ def _objects(
             )
         if entry.iscrowd not in (0, 1):
             raise DataSetError(f"{where}.iscrowd: {entry.iscrowd} is neither 0 nor 1; correct it")
-        x, y, wide, high = entry.bbox
-        if not all(map(math.isfinite, entry.bbox)) or wide < 0 or high < 0:
+        if not all(map(math.isfinite, entry.bbox)) or min(entry.bbox[2:]) < 0:
             raise DataSetError(
                 f"{where}.bbox: {list(entry.bbox)} is no box; use [x, y, width, height] in pixels"
             )
-        box = (
-            max(x, 0.0),
-            max(y, 0.0),
-            min(x + wide, float(image.width)),
-            min(y + high, float(image.height)),
-        )
+        box = _clipped(image, *entry.bbox)
         if box[2] <= box[0] or box[3] <= box[1]:
             empty += 1  # COCO's own training set has one of these
             continue
+        crowd, polygons = bool(entry.iscrowd), _polygons(where, entry.segmentation)
         found[image.id].append(
             CocoObject(
-                entry.id,
-                image.id,
-                entry.category_id,
-                box,
-                bool(entry.iscrowd),
-                _polygons(where, entry.segmentation),
-                entry.distance_m,
-                entry.visible,
+                *(entry.id, image.id, entry.category_id, box, crowd, polygons),
+                *(entry.distance_m, entry.visible),
             )
         )
     ordered = {
         image_id: tuple(sorted(group, key=lambda o: o.id)) for image_id, group in found.items()
     }
     return ordered, empty
+
+
+def _clipped(image: CocoImage, x: float, y: float, width: float, height: float) -> Box:
+    x2, y2 = min(x + width, float(image.width)), min(y + height, float(image.height))
+    return max(x, 0.0), max(y, 0.0), x2, y2
 
 
 def _polygons(where: str, segmentation: object) -> tuple[FloatArray, ...]:
@@ -383,8 +373,8 @@ def _unique(source: Path, part: str, key: str, values: Iterable[object]) -> None
         first = seen.setdefault(value, number)
         if first != number:
             raise DataSetError(
-                f"{source}: {part}[{number}].{key}: {value!r} is {part}[{first}]'s, too; each "
-                "needs its own"
+                f"{source}: {part}[{number}].{key}: {value!r} is {part}[{first}]'s, too; make it "
+                "unique"
             )
 
 
@@ -399,15 +389,11 @@ def _header_size(content: bytes) -> tuple[int, int] | None:
 
 def _decode(content: bytes) -> ImageArray:
     if content[:2] == _JPEG:
-        # A decoder of its own: the picture outlives the next call.
+        # A new decoder: the picture must outlive the next call.
         return JpegDecoder(1).decode(content)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     with silence_opencv():
-        data = np.frombuffer(content, np.uint8)
-        picture = (
-            cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-            if content
-            else None
-        )
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     if picture is None:
         raise CaptureError("cannot be decoded")
     return as_rgb(np.asarray(picture, np.uint8))

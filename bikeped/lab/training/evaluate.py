@@ -1,28 +1,27 @@
-"""Detectors measured over a data set: the paper's detection table for any model and any data.
+"""Evaluates detectors on a data set: the paper's detection table for any model and data.
 
-Three readings of the same answers of the network:
+The same network outputs are evaluated in three ways:
 
-`classes`     the network's own classes against the data's, by name: COCO's ordinary measures.
+`classes`     the network's own classes against the data's, matched by name: COCO's usual measures.
 `merged`      classes merged to pedestrian, cyclist and vehicle by the names in `detection`, as in
               the paper's table: a bicycle is a bicycle's box, and its rider a person.
-`road_users`  what the deployed detector hands to the tracker, at its confidence and suppression,
-              with riders joined to their cycles. The truth is joined by the very same rule
-              (`detection/riders.py`): a person on a bicycle and the bicycle are one cyclist, whose
-              box holds both. Data that name whole cyclists (`cyclist`) are taken as they are.
+`road_users`  as deployed, at the configured confidence and suppression, with riders joined to their
+              cycles. The ground truth is joined by the same rule (`detection/riders.py`): a person
+              on a bicycle and the bicycle are one cyclist, whose box holds both. Data with whole
+              cyclists (`cyclist`) are used as they are.
 
-The simulation's objects are road users, so its recall curve is read from the third.
+The simulation's recall curve is that of `road_users`, for its objects are road users.
 
-Areas are square pixels at a network input of 1280 pixels, whatever the picture's own size: a
-picture of w x h counts as scaled by 1280 / max(w, h), as it is letterboxed. For the sensor's
-3840 x 2160 this is the definitions' (1280/3840)^2. The curve keeps that unit for a smaller network,
-too, for the simulation asks in it.
+Areas are square pixels at a network input of 1280 pixels, for any network: a picture of w x h is
+scaled by 1280 / max(w, h), as by letterboxing. For the sensor's 3840 x 2160 this is the
+definitions' (1280/3840)^2.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -62,16 +61,16 @@ _MAX_DETECTIONS = 300  # more than the measures read
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """`confidence` and `iou` are those of `classes` and `merged`; `road_users` is as deployed."""
+    """`confidence` and `iou` (of suppression) are for `classes` and `merged` only."""
 
     confidence: float = 0.001
     iou: float = 0.65
-    least_objects: int = 20  #: of a bin of the recall curve
+    least_objects: int = 20  #: per bin of the recall curve
 
 
 @dataclass(frozen=True)
 class ModelUnderTest:
-    """A loaded model by the name that tables call it."""
+    """A loaded model and its label in tables."""
 
     label: str
     path: Path
@@ -94,7 +93,7 @@ class ModelScores:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Models measured over the same data, in the order given: the first is compared against."""
+    """Models measured over the same data, in the order given; the first is the baseline."""
 
     data: dict[str, Any]
     settings: dict[str, Any]
@@ -106,35 +105,22 @@ class Evaluation:
             "version": __version__,
             "data": self.data,
             "settings": self.settings,
-            "models": [
-                {
-                    "label": score.label,
-                    **score.facts,
-                    **{
-                        name: None
-                        if part is None
-                        else {
-                            "all": part.overall.as_dict(),
-                            "rows": [row.as_dict() for row in part.rows],
-                        }
-                        for name, part in (
-                            ("classes", score.classes),
-                            ("merged", score.merged),
-                            ("road_users", score.road_users),
-                        )
-                    },
-                    "false_per_100_pictures": {
-                        name: 100 * count / self.data["images"]
-                        for name, count in zip(KIND_NAMES, score.road_users.false, strict=True)
-                    },
-                    "recall_by_distance": score.by_distance,
-                    "recall_curve": {
-                        "all": score.curve.as_dict(),
-                        **{name: curve.as_dict() for name, curve in score.curves.items()},
-                    },
-                }
-                for score in self.scores
-            ],
+            "models": [self._model_dict(score) for score in self.scores],
+        }
+
+    def _model_dict(self, score: ModelScores) -> dict[str, Any]:
+        parts = {name: getattr(score, name) for name in ("classes", "merged", "road_users")}
+        false = zip(KIND_NAMES, score.road_users.false, strict=True)
+        curves = {"all": score.curve, **score.curves}
+        return {
+            "label": score.label,
+            **score.facts,
+            **{name: part and part.as_dict() for name, part in parts.items()},
+            "false_per_100_pictures": {
+                name: 100 * count / self.data["images"] for name, count in false
+            },
+            "recall_by_distance": score.by_distance,
+            "recall_curve": {name: asdict(curve) for name, curve in curves.items()},
         }
 
 
@@ -248,8 +234,12 @@ def write_curve(path: Path, curve: RecallCurve, at_iou_50: bool = False) -> None
     write_whole(path, "\n".join(["area_px2,recall", *lines]) + "\n")
 
 
+_NONE = np.zeros(0, np.int64)
+_EMPTY = DetectionSet(_NONE, _NONE, np.zeros((0, 4)), np.zeros(0, np.float32))
+
+
 class _ModelResults:
-    """What one model found in all pictures, for the three readings."""
+    """The detections of one model in all pictures, grouped in the three ways."""
 
     def __init__(
         self,
@@ -266,18 +256,22 @@ class _ModelResults:
         kinds = kinds_by_name(dict(enumerate(names)), detection)
         self._class_of = np.array([place.get(plain_name(name), -1) for name in names], np.int64)
         self._kind_of = np.array([int(kinds.get(n, -1)) for n in range(len(names))], np.int64)
-        self._parts: tuple[list[_Part], ...] = ([], [], [])
+        self._found: tuple[list[DetectionSet], ...] = ([_EMPTY], [_EMPTY], [_EMPTY])
 
     def add(self, image: int, users: Detections, every: Candidates, scale: float) -> None:
-        """The answers for one picture; boxes become pixels at the network's input."""
-        for part, group_of in ((0, self._class_of), (1, self._kind_of)):
+        """Adds one picture's detections; `scale` is from its pixels to the network's input."""
+        groups = []
+        for group_of in (self._class_of, self._kind_of):
             group = group_of[every.class_id]
             wanted = group >= 0
             box, score, group = every.box[wanted], every.score[wanted], group[wanted]
             keep = non_max_suppression(box, score, group, self._iou, _MAX_DETECTIONS)
-            self._parts[part].append(_Part(image, group[keep], box[keep] * scale, score[keep]))
-        kind = users.kind.astype(np.int64)
-        self._parts[2].append(_Part(image, kind, users.box_px * scale, users.confidence))
+            groups.append((group[keep], box[keep], score[keep]))
+        groups.append((users.kind.astype(np.int64), users.box_px, users.confidence))
+        for found, (group, box, score) in zip(self._found, groups, strict=True):
+            number = np.full(len(score), image, np.int64)
+            scaled = (box * scale).astype(np.float64)
+            found.append(DetectionSet(number, group, scaled, score))
 
     def score(
         self,
@@ -287,8 +281,8 @@ class _ModelResults:
         settings: EvaluationSettings,
     ) -> ModelScores:
         """Measures everything that was added."""
-        found = [_concatenated(parts) for parts in self._parts]
-        users = measure(truths[2], found[2], KIND_NAMES, images)
+        found = [_concatenated(parts) for parts in self._found]
+        users, least = measure(truths[2], found[2], KIND_NAMES, images), settings.least_objects
         detector = self._model.detector
         return ModelScores(
             self._model.label,
@@ -301,28 +295,16 @@ class _ModelResults:
             measure(truths[0], found[0], names, images) if names else None,
             measure(truths[1], found[1], KIND_NAMES, images),
             users,
-            recall_curve(truths[2], users.hits, settings.least_objects),
-            {
-                kind.label: recall_curve(truths[2], users.hits, settings.least_objects, int(kind))
-                for kind in Kind
-            },
+            recall_curve(truths[2], users.hits, least),
+            {k.label: recall_curve(truths[2], users.hits, least, int(k)) for k in Kind},
             {kind.label: recall_by_distance(truths[2], users.hits, int(kind)) for kind in Kind},
         )
 
 
-@dataclass(frozen=True)
-class _Part:
-    image: int
-    category: Any
-    box_px: Any
-    score: Any
-
-
-def _concatenated(parts: Sequence[_Part]) -> DetectionSet:
-    none = [np.zeros(0)]
+def _concatenated(parts: Sequence[DetectionSet]) -> DetectionSet:
     return DetectionSet(
-        np.concatenate([np.full(len(p.score), p.image) for p in parts] or none).astype(np.int64),
-        np.concatenate([p.category for p in parts] or none).astype(np.int64),
-        np.concatenate([p.box_px for p in parts] or [np.zeros((0, 4))]).astype(np.float64),
-        np.concatenate([p.score for p in parts] or none).astype(np.float32),
+        np.concatenate([part.image for part in parts]),
+        np.concatenate([part.category for part in parts]),
+        np.concatenate([part.box_px for part in parts]),
+        np.concatenate([part.score for part in parts]),
     )

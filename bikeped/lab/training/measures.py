@@ -1,4 +1,4 @@
-"""COCO's measures over boxes, by pycocotools, and recall against area.
+"""COCO's detection measures by pycocotools, and recall against area and distance.
 
 Average precision is the mean over IoU 0.50, 0.55, ... 0.95 of the area under the interpolated
 precision-recall curve; average recall the mean over the same of the largest recall with at most 100
@@ -10,10 +10,11 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from bikeped.errors import require
 from bikeped.lab.simulation.perception import SIZE_BOUNDS_PX2
@@ -72,18 +73,9 @@ class ClassMeasures:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        small, medium, large = self.ar_by_size
-        return {
-            "name": self.name,
-            "objects": self.objects,
-            "ap": self.ap,
-            "ap50": self.ap50,
-            "ar": self.ar,
-            "ar_small": small,
-            "ar_medium": medium,
-            "ar_large": large,
-            "objects_by_size": list(self.objects_by_size),
-        }
+        body = asdict(self)
+        sizes = zip(("small", "medium", "large"), body.pop("ar_by_size"), strict=True)
+        return body | {f"ar_{size}": recall for size, recall in sizes}
 
 
 @dataclass(frozen=True)
@@ -99,6 +91,10 @@ class Measures:
     hits: BoolArray
     false: tuple[int, ...]
 
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"all": self.overall.as_dict(), "rows": [row.as_dict() for row in self.rows]}
+
 
 @dataclass(frozen=True)
 class RecallCurve:
@@ -111,15 +107,6 @@ class RecallCurve:
     recall: tuple[float, ...]
     recall50: tuple[float, ...]
     objects: tuple[int, ...]
-
-    def as_dict(self) -> dict[str, list[float] | list[int]]:
-        """For JSON."""
-        return {
-            "area_px2": list(self.area_px2),
-            "recall": list(self.recall),
-            "recall50": list(self.recall50),
-            "objects": list(self.objects),
-        }
 
 
 def measure(truth: GroundTruth, found: DetectionSet, names: Sequence[str], images: int) -> Measures:
@@ -155,8 +142,8 @@ def recall_curve(
 ) -> RecallCurve:
     """Recall over area bins, of all classes together or of one.
 
-    A bin with fewer than `least_objects` objects joins the next larger one, the last one the one
-    before: a share of three objects is no recall. Without objects the curve is empty.
+    A bin with fewer than `least_objects` objects is merged into the next larger one, the last one
+    into the one before. Without objects the curve is empty.
     """
     own = ~truth.crowd
     if category is not None:
@@ -181,9 +168,9 @@ def recall_curve(
 
 
 def recall_by_distance(truth: GroundTruth, hits: BoolArray, category: int) -> list[dict[str, Any]]:
-    """Of one class, for each bin of distance: how many objects, and how many found at IoU 0.50.
+    """Objects and found objects (IoU 0.50) of one class by distance.
 
-    Bins without objects are left out, and so are objects whose distance is not known.
+    Bins without objects and objects of unknown distance are left out.
     """
     own = (truth.category == category) & ~truth.crowd & np.isfinite(truth.distance_m)
     ends = (*DISTANCE_EDGES_M[1:], np.inf)
@@ -208,31 +195,9 @@ def _evaluation(truth: GroundTruth, found: DetectionSet, classes: int, images: i
     require("pycocotools")
     from pycocotools.cocoeval import COCOeval
 
-    gt_area, dt_area = truth.area_px2, _area(found.box_px)
-    # Numbers from 1: a match is told by the other's number, and 0 means none.
-    gt = [
-        {
-            "id": i + 1,
-            "image_id": int(truth.image[i]),
-            "category_id": int(truth.category[i]),
-            "bbox": _xywh(truth.box_px[i]),
-            "area": float(gt_area[i]),
-            "iscrowd": int(truth.crowd[i]),
-        }
-        for i in range(len(truth.image))
-    ]
-    dt = [
-        {
-            "id": i + 1,
-            "image_id": int(found.image[i]),
-            "category_id": int(found.category[i]),
-            "bbox": _xywh(found.box_px[i]),
-            "area": float(dt_area[i]),
-            "score": float(found.score[i]),
-        }
-        for i in range(len(found.image))
-    ]
-    with contextlib.redirect_stdout(io.StringIO()):  # it tells its progress there
+    gt = _annotations(truth, "iscrowd", truth.crowd.astype(int))
+    dt = _annotations(found, "score", found.score)
+    with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
         evaluation = COCOeval(
             _coco(gt, classes, images), _coco(dt, classes, images), iouType="bbox"
         )
@@ -243,6 +208,23 @@ def _evaluation(truth: GroundTruth, found: DetectionSet, classes: int, images: i
         evaluation.evaluate()
         evaluation.accumulate()
     return evaluation
+
+
+def _annotations(
+    boxes: GroundTruth | DetectionSet, key: str, values: npt.NDArray[Any]
+) -> list[dict[str, Any]]:
+    """COCO's entries, with `values` [n] as `key`. Ids are from 1: as a match, 0 means none."""
+    size = boxes.box_px[:, 2:] - boxes.box_px[:, :2]
+    rows = zip(
+        boxes.image.tolist(),
+        boxes.category.tolist(),
+        np.hstack([boxes.box_px[:, :2], size]).tolist(),
+        _area(boxes.box_px).tolist(),
+        values.tolist(),
+        strict=True,
+    )
+    keys = ("image_id", "category_id", "bbox", "area", key)
+    return [{"id": i, **dict(zip(keys, row, strict=True))} for i, row in enumerate(rows, 1)]
 
 
 def _coco(annotations: list[dict[str, Any]], classes: int, images: int) -> Any:
@@ -263,14 +245,13 @@ def _hits(evaluation: Any, objects: int, classes: int) -> tuple[BoolArray, tuple
     hits = np.zeros((objects, len(evaluation.params.iouThrs)), np.bool_)
     false = [0] * classes
     everything = evaluation.params.areaRng[0]
-    for judged in evaluation.evalImgs:
-        if judged is not None and judged["aRng"] == everything:
-            index = np.asarray(judged["gtIds"], np.int64) - 1
-            hits[index] = (np.asarray(judged["gtMatches"]) > 0).T
-            wrong = (np.asarray(judged["dtMatches"])[0] == 0) & (
-                np.asarray(judged["dtIgnore"])[0] == 0
-            )
-            false[judged["category_id"]] += int(np.count_nonzero(wrong))
+    for image in evaluation.evalImgs:
+        if image is not None and image["aRng"] == everything:
+            index = np.asarray(image["gtIds"], np.int64) - 1
+            hits[index] = (np.asarray(image["gtMatches"]) > 0).T
+            unmatched = np.asarray(image["dtMatches"])[0] == 0
+            wrong = unmatched & (np.asarray(image["dtIgnore"])[0] == 0)
+            false[image["category_id"]] += int(np.count_nonzero(wrong))
     return hits, tuple(false)
 
 
@@ -291,15 +272,10 @@ def _overall(rows: Sequence[ClassMeasures]) -> ClassMeasures:
 
 
 def _mean(values: FloatArray) -> float | None:
-    """The mean of what could be measured: pycocotools says -1 where there was nothing."""
+    """The mean of the measured values: pycocotools gives -1 for none."""
     known = values[values > -1]
     return float(known.mean()) if known.size else None
 
 
 def _area(box_px: FloatArray) -> FloatArray:
     return np.asarray((box_px[:, 2] - box_px[:, 0]) * (box_px[:, 3] - box_px[:, 1]))
-
-
-def _xywh(box: FloatArray) -> list[float]:
-    x1, y1, x2, y2 = box.tolist()
-    return [x1, y1, x2 - x1, y2 - y1]

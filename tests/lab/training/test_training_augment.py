@@ -16,7 +16,6 @@ from bikeped.errors import DataSetError, GeometryError
 from bikeped.geometry import Lens
 from bikeped.lab.training.augment import (
     AugmentSettings,
-    augment_boxes,
     augment_data,
     augment_picture,
     picture_generator,
@@ -42,6 +41,12 @@ def straight(fov_deg=180.0, **changes):
     """A lens in the middle of a square of 400, the picture straight ahead."""
     lens = Lens.from_circle("equidistant", 200, fov_deg)
     return Warp(lens, (200, 200), 400, **{"picture_fov_deg": 90.0, **changes})
+
+
+def boxes_after(box, warp, **options):
+    """Boxes after the warp, and which of them are kept."""
+    blank = np.zeros((PICTURE[1], PICTURE[0], 3), np.uint8)
+    return augment_picture(blank, box, warp, **options)[1:]
 
 
 @st.composite
@@ -203,15 +208,15 @@ def test_what_is_kept():
     # The lens ends 50 degrees off; the picture's middle lies there, its left half is seen.
     warp = straight(fov_deg=100.0, yaw_deg=50.0)
     box = [[0, 0, 160, 240], [60, 60, 260, 180], [200, 60, 300, 180], [10, 10, 10.6, 100]]
-    _, kept = augment_boxes(box, PICTURE, warp)
+    _, kept = boxes_after(box, warp)
     assert kept.tolist() == [True, True, False, False]
     _, share = warp_boxes(warp, PICTURE, box)
     assert share[1] == pytest.approx(0.5, abs=0.06)
-    _, kept = augment_boxes(box, PICTURE, warp, least_share=0.6)
+    _, kept = boxes_after(box, warp, least_share=0.6)
     assert kept.tolist() == [True, False, False, False]
-    _, kept = augment_boxes(box, PICTURE, warp, least_share=0.6, crowd=[False, True, True, False])
+    _, kept = boxes_after(box, warp, least_share=0.6, crowd=[False, True, True, False])
     assert kept.tolist() == [True, True, False, False]
-    boxes, kept = augment_boxes([], PICTURE, warp)
+    boxes, kept = boxes_after([], warp)
     assert boxes.shape == (0, 4)
     assert kept.shape == (0,)
 
