@@ -1,8 +1,7 @@
-"""`bikeped align`: the ground grid over a picture, in the browser or without one."""
+"""`bikeped align`: height, pitch and lens of the camera, fitted to marks on the street."""
 
 from __future__ import annotations
 
-import itertools
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from bikeped.web.align_points import Points
     from bikeped.web.align_save import Saved
 
-_PICTURES = {".png", ".jpg", ".jpeg"}
-
 
 @click.command("align")
 @click.argument("picture", metavar="FRAME", type=click.Path(path_type=Path))
@@ -41,22 +38,22 @@ _PICTURES = {".png", ".jpg", ".jpeg"}
     type=FiniteRange(0, 1e6),
     default=0.0,
     metavar="SECONDS",
-    help="Of a video: the frame at this time; default: the first.",
+    help="The frame of a video at this time; default: the first.",
 )
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port; default: a free one.")
-@click.option("--no-browser", is_flag=True, help="Only print the address.")
+@click.option("--no-browser", is_flag=True, help="Print the address only, open no browser.")
 @click.option(
     "--points",
     "points_path",
     type=click.Path(path_type=Path),
-    help="Fit these marks (a file that the page exports) and end: no browser.",
+    help="Fit the marks of this file, which the page exports, without a browser.",
 )
-@click.option("--save", "write", is_flag=True, help="With --points: write the fit into -c.")
+@click.option("--save", "write", is_flag=True, help="With --points: write the fitted keys into -c.")
 @click.option(
     "--grid",
     "grid_path",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw the grid over FRAME into this .png or .jpg and end: no browser.",
+    help="Draw the ground grid over FRAME into this .png or .jpg, without a browser.",
 )
 @json_option
 @guarded
@@ -72,20 +69,20 @@ def command(
     grid_path: Path | None,
     json_path: str | None,
 ) -> int:
-    """Set height, pitch and lens by the ground grid over FRAME (a picture or a video).
+    """Fit the camera's height, pitch and lens to marks on the street in FRAME (picture or video).
 
-    Serves the align page until Ctrl-C. With --points or --grid it works without a browser, and
-    ends with 1 when the marks do not agree with one another.
+    Serves the align page, with the ground grid over FRAME, until Ctrl-C. With --points or --grid it
+    needs no browser, and ends with 1 when the marks do not agree with one another.
     """
     from bikeped.web.align_points import fit_json, fit_points, load_points
 
     loaded = load_config(config_path, overrides)
-    frame = _read(picture, loaded, at_s)
+    frame = _read_frame(picture, loaded, at_s)
     if points_path is None and (write or json_path is not None):
-        raise BikepedError("--points: missing; --save and --json are about the fit of marks")
-    if grid_path is not None and grid_path.suffix.lower() not in _PICTURES:
+        raise BikepedError("--points: missing; --save and --json need a fit of marks")
+    if grid_path is not None and grid_path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise BikepedError(f"--grid {grid_path}: cannot be drawn; name a .png or .jpg file")
-    framing(loaded).for_frame(frame.width, frame.height)  # says what to set when it does not fit
+    framing(loaded).for_frame(frame.width, frame.height)  # raises when it does not fit
     if points_path is None and grid_path is None:
         _serve(loaded, frame, picture, port, no_browser)
         return 0
@@ -105,10 +102,10 @@ def command(
             _print(found, saved)
     if json_path != "-" and grid_path is not None:
         click.echo(f"wrote {grid_path}")
-    return 1 if found is not None and found.outliers else 0
+    return int(found is not None and bool(found.outliers))
 
 
-def _read(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
+def _read_frame(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
     """One frame of a picture, a folder or a video."""
     from bikeped.capture import open_source
 
@@ -123,7 +120,7 @@ def _read(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
         fourcc=camera.fourcc,
     )
     try:
-        for frame in itertools.takewhile(lambda f: f is not None, iter(source.read, None)):
+        for frame in iter(source.read, None):
             if frame.captured_s >= at_s - 1e-6:
                 return frame
     finally:
@@ -194,17 +191,10 @@ def _print(found: AlignmentFit, saved: Saved | None) -> None:
         value = getattr(found.alignment, key)
         fitted.append((f"{PARAMETER_NAMES[key]} (camera.{key})", f"{value:.4f}", f"{error:.4f}"))
     screen.print(text_table(("", "fitted", "+/-"), fitted))
-    residuals = [
-        (
-            r.mark,
-            r.quantity,
-            f"{r.measured_m:.2f}",
-            f"{r.read_m:.2f}",
-            f"{100 * r.error_m:+.1f}",
-            "look again" if r.is_outlier else "",
-        )
-        for r in found.residuals
-    ]
+    residuals = []
+    for r in found.residuals:
+        metres = (f"{r.measured_m:.2f}", f"{r.read_m:.2f}", f"{100 * r.error_m:+.1f}")
+        residuals.append((r.mark, r.quantity, *metres, "look again" if r.is_outlier else ""))
     columns = ("mark", "what", "measured m", "reads m", "off cm", "")
     screen.print(text_table(columns, residuals, align="llrrrl"))
     if found.standard_error_at_10m_m is not None:
@@ -212,9 +202,8 @@ def _print(found: AlignmentFit, saved: Saved | None) -> None:
     if not found.redundancy:
         screen.print("no measurement is left over: nothing checks these numbers; add a mark")
     if found.suspect_mark is not None:
-        screen.print(
-            f"the others agree without mark {escape(found.suspect_mark)}: measure it again"
-        )
+        mark = escape(found.suspect_mark)
+        screen.print(f"the others agree without mark {mark}: measure it again")
     elif found.outliers:
         screen.print("the marks do not agree with one another: measure them again")
     if saved is not None:

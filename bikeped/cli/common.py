@@ -1,4 +1,4 @@
-"""What every command shares: options, errors on one line, JSON output, progress."""
+"""What all commands share: options, JSON output, tables, progress bar, log."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class FiniteRange(click.FloatRange):
-    """A number in a range that is a number: `nan` is in every range that compares."""
+    """A finite number in a range: click's own range accepts `nan`."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
         found = float(super().convert(value, param, ctx))
@@ -36,7 +36,7 @@ class FiniteRange(click.FloatRange):
 
 
 def config_options(command: F) -> F:
-    """`-c` and `--set`, here and on every command that reads a configuration."""
+    """`-c` and `--set`, on every command that reads a configuration."""
     command = click.option(
         "--set",
         "overrides",
@@ -73,12 +73,12 @@ def write_json(data: Any, target: str) -> None:
 
 
 def console(json_path: str | None = None) -> Console:
-    """Where tables for people go: standard output, unless JSON goes there."""
+    """The console for tables: standard output, or standard error when JSON goes there."""
     from rich.console import Console
 
     screen = Console(stderr=json_path == "-", highlight=False, soft_wrap=True)
     if not screen.is_terminal:
-        screen.width = 250  # a file or a pipe is as wide as the table needs
+        screen.width = 250  # do not wrap in a file or a pipe
     return screen
 
 
@@ -117,7 +117,7 @@ def text_table(
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A progress bar on standard error when that is a terminal; calls take the count so far."""
+    """A progress bar on standard error if that is a terminal; call it with the count so far."""
     screen = console("-")
     if not screen.is_terminal:
         yield lambda done: None
@@ -137,7 +137,7 @@ def progress_bar(what: str, total: int | None) -> Iterator[Callable[[int], None]
 
 
 def set_up_logging(level: str) -> None:
-    """Log lines on standard error; under systemd the journal adds the time itself."""
+    """Log lines on standard error; under systemd without the time, which the journal adds."""
     form = "%(levelname)s %(name)s: %(message)s"
     if "JOURNAL_STREAM" not in os.environ:
         form = "%(asctime)s " + form

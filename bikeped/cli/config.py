@@ -26,7 +26,7 @@ def command() -> None:
 @json_option
 @guarded
 def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
-    """Say what is wrong with the configuration, or that all is well."""
+    """Check the configuration; report the first error, or a summary."""
     from bikeped.feedback import check_light
 
     loaded = load_config(config_path, overrides)
@@ -38,8 +38,7 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
     file = None if model is None else model_file(model, loaded.base_dir)
     if file is not None and not file.is_file():
         raise ConfigError(
-            f"{loaded.source}: detection.model: {file} does not exist; correct the "
-            "path or export the model there"
+            f"{loaded.source}: detection.model: {file} does not exist; correct the path"
         )
     report = {
         "ok": True,
@@ -52,7 +51,7 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
     if json_path is not None:
         write_json(report, json_path)
     if json_path != "-":
-        click.echo(f"{loaded.source}: good; configuration {loaded.hash[:12]}")
+        click.echo(f"{loaded.source}: valid; configuration {loaded.hash[:12]}")
         click.echo(
             f"lens {camera.lens.projection}, f = {camera.lens.focal_px:.2f} px, "
             f"height {camera.height_m:g} m, pitch {camera.pitch_deg:g} degrees"
@@ -66,7 +65,7 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
 @json_option
 @guarded
 def show(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
-    """Show the whole effective configuration as YAML."""
+    """Print the whole effective configuration as YAML."""
     loaded = load_config(config_path, overrides)
     if json_path is not None:
         write_json(msgspec.to_builtins(loaded.config), json_path)
@@ -80,7 +79,7 @@ def show(config_path: Path | None, overrides: tuple[str, ...], json_path: str | 
 @json_option
 @guarded
 def schema(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
-    """Show the JSON Schema of the configuration."""
+    """Print the JSON Schema of the configuration."""
     from bikeped.config.docs import json_schema
 
     data = json_schema()

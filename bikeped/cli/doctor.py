@@ -1,4 +1,4 @@
-"""`bikeped doctor`: what works, what does not, and what to do about it."""
+"""`bikeped doctor`: checks of the installation, each with a remedy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skipped": "dim"
 
 @click.command("doctor")
 @config_options
-@click.option("--no-light", is_flag=True, help="Do not touch the lamps: they speak to the street.")
+@click.option("--no-light", is_flag=True, help="Do not switch the lamps: road users see them.")
 @click.option("--no-sound", is_flag=True, help="Do not play the chime.")
 @json_option
 @guarded
@@ -41,11 +41,11 @@ def command(
         loaded = load_config(config_path, overrides)
     except BikepedError as error:
         if not file.is_file() or overrides:
-            raise  # the command line is wrong, not the pole
-        findings.append(Finding("configuration", "fail", str(error), "the rest waits for this"))
+            raise  # the command line is wrong, not the installation
+        findings.append(Finding("configuration", "fail", str(error), "the other checks need it"))
     else:
         todo = checks(light=not no_light, sound=not no_sound)
-        screen = console("-")  # what is going on, where no JSON goes
+        screen = console("-")  # progress on standard error
         with screen.status("checking") as status:
             for check, finding in zip(todo, run_checks(loaded, todo), strict=True):
                 findings.append(finding)

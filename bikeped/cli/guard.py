@@ -1,4 +1,4 @@
-"""No command may write over what it reads, or write two things into one file."""
+"""Refuses an output that would overwrite an input, and two outputs in one file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bikeped.errors import BikepedError
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-#: Parameters of commands that name what is read, and what is written, and how people know them.
+#: Parameters that name an input, or an output, and what the command line calls them.
 _INPUTS = {
     "video": "VIDEO",
     "scenario": "SCENARIO",
@@ -50,7 +50,7 @@ _OUTPUTS = {
 
 
 def guarded(command: F) -> F:
-    """Checks the command's files before it starts; sits right above the function.
+    """Checks the command's files before it runs; the innermost decorator, right above the function.
 
     Raises BikepedError when an output is an input (or lies in an input folder and exists), when two
     outputs are one file, and when an output cannot be written.
@@ -73,7 +73,7 @@ def guarded(command: F) -> F:
 
 
 def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[str, Path]]) -> None:
-    """See `guarded`; each is how the command line names it, and the path."""
+    """See `guarded`; each file is what the command line calls it, and its path."""
     read = [(name, path, path.resolve()) for name, path in inputs if _exists(str(path))]
     written: dict[Path, str] = {}
     for name, path in outputs:
@@ -90,7 +90,7 @@ def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[st
                 )
         if target in written:
             raise BikepedError(
-                f"{name} {path}: is {written[target]}, too; give each output its own file"
+                f"{name} {path}: is also {written[target]}; give each output its own file"
             )
         written[target] = name
         folder = target.parent
@@ -125,7 +125,7 @@ def _is_folder(name: str, given: Mapping[str, Any]) -> bool:
 
 
 def written_paths(value: Any) -> list[Path]:
-    """The path of an output parameter: none, or one; `-` is standard output."""
+    """The path of an output parameter as a list, empty for None and for `-` (standard output)."""
     return [] if value is None or value == "-" else [Path(str(value))]
 
 

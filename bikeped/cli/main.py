@@ -39,10 +39,10 @@ COMMANDS = {
     type=click.Choice(["debug", "info", "warning", "error"]),
     default="warning",
     show_default=True,
-    help="How much to say on standard error; `run` says at least info.",
+    help="Least level of log lines on standard error; `run` logs at least info.",
 )
 def cli(log_level: str) -> None:
-    """Warns cyclists and pedestrians at a crossing of one another."""
+    """Warn cyclists and pedestrians at a crossing of one another."""
     set_up_logging(log_level)
 
 

@@ -16,7 +16,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded
-from bikeped.cli.web_options import open_pages, say_where, web_option, web_overrides
+from bikeped.cli.web_options import open_pages, print_address, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.files import make_folder
 
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 )
 @click.option("--overlay", type=click.Path(path_type=Path), help="Overlay video, .mp4.")
 @click.option("--events", type=click.Path(path_type=Path), help="Event file, JSON Lines.")
-@click.option("--no-mqtt", is_flag=True, help="Publish nothing, whatever the configuration says.")
-@click.option("--realtime", is_flag=True, help="At the recording's own pace.")
+@click.option("--no-mqtt", is_flag=True, help="Do not publish, whatever the configuration says.")
+@click.option("--realtime", is_flag=True, help="Run at the recording's frame rate.")
 @web_option
 @json_option
 @guarded
@@ -53,7 +53,7 @@ def command(
     web_place: str | None,
     json_path: str | None,
 ) -> int:
-    """Run VIDEO (a file or a folder of pictures) through the loop and say what it decided."""
+    """Run VIDEO (a file or a folder of pictures) through the loop; print its decisions."""
     from bikeped.pipeline.replay import ReplayFiles, replay
 
     if web_place is not None:
@@ -75,7 +75,7 @@ def command(
             mqtt=not no_mqtt,
             progress=progress,
             pages=pages,
-            serving=say_where,
+            serving=print_address,
         )
     summary = result.as_dict()
     if out is not None:

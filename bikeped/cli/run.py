@@ -18,7 +18,7 @@ from bikeped.config import load_config
 @click.command("run")
 @config_options
 def command(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
-    """Watch the crossing until told to stop (SIGTERM): the service."""
+    """Run the service until SIGTERM: camera, detection, tracking, decision, light and sound."""
     from bikeped.pipeline.run import run_service
 
     root = logging.getLogger()
@@ -26,8 +26,8 @@ def command(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
     loaded = load_config(config_path, overrides)
     pages = open_pages(loaded) if loaded.config.web.enabled else None
     status = run_service(loaded, pages=pages)
-    # Everything is stopped and the light is dark. A thread that is stuck in a driver must not keep
-    # the process: leave without joining it.
+    # Everything is stopped and the light is dark. A thread that hangs in a driver must not keep the
+    # process alive: exit without joining it.
     logging.shutdown()
     sys.stdout.flush()
     os._exit(status)

@@ -1,4 +1,4 @@
-"""`--web [HOST:]PORT`: look at a replay in the browser while it runs."""
+"""`--web [HOST:]PORT`: the live page of a replay while it runs."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def web_option(command: F) -> F:
         "--web",
         "web_place",
         metavar="[HOST:]PORT",
-        help="Serve the live page while it runs, at the recording's own pace; e.g. 8080.",
+        help="Serve the live page meanwhile, at the recording's frame rate; e.g. 8080.",
     )(command)
 
 
 def web_overrides(place: str) -> tuple[str, ...]:
-    """`--web`'s value as overrides of the configuration; BikepedError when it is no address."""
+    """The value of `--web` as configuration overrides; BikepedError when it is no address."""
     found = _PLACE.fullmatch(place.strip())
     if found is None:
         raise BikepedError(f"--web {place}: is not [HOST:]PORT; give e.g. 8080 or 127.0.0.1:8080")
@@ -38,13 +38,16 @@ def web_overrides(place: str) -> tuple[str, ...]:
     return ("web.enabled=true", f"web.host={host!r}", f"web.port={int(found['port'])}")
 
 
-def say_where(address: str) -> None:
-    """Tells on standard error where the page is."""
+def print_address(address: str) -> None:
+    """Prints on standard error where the page is."""
     click.echo(f"{address} shows it while it runs", err=True)
 
 
 def open_pages(loaded: LoadedConfig) -> ServicePages:
-    """The pages of a service or a replay; ConfigError when others could see them unasked."""
+    """The pages of a service or a replay; imports the web only now.
+
+    ConfigError when others could reach them without a token.
+    """
     from bikeped.web.service_pages import ServicePages
 
     return ServicePages(loaded)

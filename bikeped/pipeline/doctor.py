@@ -1,7 +1,7 @@
-"""The checks of `bikeped doctor`: each on its own, each bounded in time, none trusting another.
+"""The checks of `bikeped doctor`: independent of one another, each bounded in time.
 
 A check returns a `Finding` or raises; what it raises becomes a `fail`. `fail` means that the
-service cannot do its work, `warn` that it does, but somebody should look.
+service cannot work, `warn` that it works, but a person should look into it.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from bikeped.types import Frame, Sound
 
 Status = Literal["ok", "warn", "fail", "skipped"]
 
-LOOK_S = 1.0  #: how long frames are counted
+MEASURE_S = 1.0  #: how long frames are counted
 LAMP_S = 0.4  #: how long each colour shows
-LEAST_YEAR = 2025  #: a clock before this was never set
-HOT_C = 85.0  #: a Jetson slows itself down somewhat above this
+FIRST_YEAR = 2025  #: a clock before this was never set
+HOT_C = 85.0  #: a Jetson throttles a few degrees above this
 MB = 1_000_000
 
 
@@ -72,8 +72,8 @@ def checks(*, light: bool = True, sound: bool = True) -> tuple[Check, ...]:
         Check("camera", check_camera, 30),
         # Building an engine for the first time takes minutes.
         Check("model", check_model, 1800),
-        Check("light", check_light if light else _left_out("light", "--no-light"), 15),
-        Check("speaker", check_speaker if sound else _left_out("speaker", "--no-sound"), 15),
+        Check("light", check_light if light else _skip("light", "--no-light"), 15),
+        Check("speaker", check_speaker if sound else _skip("speaker", "--no-sound"), 15),
         Check("broker", check_broker, 15),
         Check("clock", check_clock, 10),
         Check("disk", check_disk, 10),
@@ -84,10 +84,10 @@ def checks(*, light: bool = True, sound: bool = True) -> tuple[Check, ...]:
 def run_checks(loaded: LoadedConfig, todo: tuple[Check, ...]) -> Iterator[Finding]:
     """The findings one by one. A check that hangs is left behind in its thread."""
     for check in todo:
-        yield _bounded(check, loaded)
+        yield _run_bounded(check, loaded)
 
 
-def _bounded(check: Check, loaded: LoadedConfig) -> Finding:
+def _run_bounded(check: Check, loaded: LoadedConfig) -> Finding:
     answers: queue.SimpleQueue[Finding] = queue.SimpleQueue()
 
     def work() -> None:
@@ -103,30 +103,25 @@ def _bounded(check: Check, loaded: LoadedConfig) -> Finding:
     try:
         return answers.get(timeout=check.limit_s)
     except queue.Empty:
-        return Finding(
-            check.name, "fail", f"no answer within {check.limit_s:g} s", "unplug it, or restart"
-        )
+        text = f"no answer within {check.limit_s:g} s"
+        return Finding(check.name, "fail", text, "unplug the device, or restart")
 
 
 def check_configuration(loaded: LoadedConfig) -> Finding:
     """Whether lens, framing and ground fit together."""
     camera = GroundMapper(loaded).camera
-    return Finding(
-        "configuration",
-        "ok",
-        f"{loaded.source}, {loaded.hash[:12]}; {camera.lens.projection}, "
-        f"f = {camera.lens.focal_px:.1f} px, {camera.height_m:g} m up, pitch "
-        f"{camera.pitch_deg:g} degrees",
-    )
+    lens = f"{camera.lens.projection}, f = {camera.lens.focal_px:.1f} px"
+    pose = f"{camera.height_m:g} m up, pitch {camera.pitch_deg:g} degrees"
+    return Finding("configuration", "ok", f"{loaded.source}, {loaded.hash[:12]}; {lens}, {pose}")
 
 
 def check_camera(loaded: LoadedConfig) -> Finding:
     """Opens the camera, reads for a second, decodes the last frame."""
     camera = loaded.config.camera
     try:
-        frames, seconds, promised, live = _look(loaded)
+        frames, seconds, granted_fps, live = _read_frames(loaded)
     except CaptureError as error:
-        return _held_by_service("camera", *_split(str(error)))
+        return _device_error("camera", error)
     last = frames[-1]
     GroundMapper(loaded).framing_for(last.width, last.height)
     began = time.perf_counter()
@@ -135,27 +130,18 @@ def check_camera(loaded: LoadedConfig) -> Finding:
     decode_ms = (time.perf_counter() - began) * 1e3
     what = f"{camera.source}: {last.width} x {last.height}"
     if not live:
-        return Finding(
-            "camera",
-            "warn",
-            f"{what}, a recording",
-            "set camera.source to the camera, once there is one",
-        )
+        return Finding("camera", "warn", f"{what}, a recording", "set camera.source to a camera")
     fps = (len(frames) - 1) / seconds if len(frames) > 1 else 0.0
-    detail = f"{what}, {fps:.1f} frames/s measured, {promised:g} granted, decoded in "
-    detail += f"{decode_ms:.1f} ms"
+    rate = f"{fps:.1f} frames/s measured, {granted_fps:g} granted"
+    detail = f"{what}, {rate}, decoded in {decode_ms:.1f} ms"
     if fps < 0.8 * camera.fps:
-        return Finding(
-            "camera",
-            "warn",
-            detail,
-            f"camera.fps asks for {camera.fps:g}: is it dark (long exposure), is the cable USB 3?",
-        )
+        remedy = f"camera.fps asks for {camera.fps:g}: is it dark (long exposure), the cable USB 3?"
+        return Finding("camera", "warn", detail, remedy)
     return Finding("camera", "ok", detail)
 
 
-def _look(loaded: LoadedConfig) -> tuple[list[Frame], float, float, bool]:
-    """Frames of a second (or of a recording), the time they took, the promised rate, live?"""
+def _read_frames(loaded: LoadedConfig) -> tuple[list[Frame], float, float, bool]:
+    """Frames of a second (or of a recording), the seconds they took, granted rate, whether live."""
     camera = loaded.config.camera
     with open_source(
         camera.source,
@@ -166,13 +152,12 @@ def _look(loaded: LoadedConfig) -> tuple[list[Frame], float, float, bool]:
     ) as source:
         frames: list[Frame] = []
         began = ended = time.monotonic()
-        while ended - began < LOOK_S:
+        while ended - began < MEASURE_S:
             frame = source.read()
             if frame is None:
                 break
             if not frames:
                 began = time.monotonic()  # the first frame comes with what starting a camera takes
-            # Only the last one's picture is looked at.
             frames = [*frames[-1000:], frame]
             ended = time.monotonic()
         if not frames:
@@ -181,7 +166,7 @@ def _look(loaded: LoadedConfig) -> tuple[list[Frame], float, float, bool]:
 
 
 def check_model(loaded: LoadedConfig) -> Finding:
-    """Loads the model and looks at a grey frame a few times."""
+    """Loads the model and times it on a grey frame."""
     camera = loaded.config.camera
     began = time.perf_counter()
     detector = load_detector_pool(loaded)
@@ -197,15 +182,13 @@ def check_model(loaded: LoadedConfig) -> Finding:
     ms = statistics.median(times)
     detail = f"{detector.name}: {ms:.1f} ms a frame, loaded in {loaded_s:.1f} s"
     if loaded.config.detection.model == BUNDLED:
-        return Finding("model", "warn", f"{detail}; {NOT_FOR_STREETS}", "name a model of real ones")
-    if ms > 1e3 / camera.fps:
+        detail = f"{detail}; {NOT_FOR_STREETS}"
         return Finding(
-            "model",
-            "warn",
-            detail,
-            f"slower than {camera.fps:g} frames/s: use the GPU (detection.providers) or a smaller "
-            "model",
+            "model", "warn", detail, "set detection.model to one trained on real streets"
         )
+    if ms > 1e3 / camera.fps:
+        remedy = "use the GPU (detection.providers) or a smaller model"
+        return Finding("model", "warn", f"{detail}, slower than {camera.fps:g} frames/s", remedy)
     return Finding("model", "ok", detail)
 
 
@@ -221,9 +204,9 @@ def check_light(loaded: LoadedConfig) -> Finding:
         finally:
             light.close()
     except BikepedError as error:
-        return _held_by_service("light", *_split(str(error)))
+        return _device_error("light", error)
     if feedback.light == "simulated":
-        return Finding("light", "warn", "simulated: nobody sees it", "set feedback.light")
+        return Finding("light", "warn", "simulated: no lamp is connected", "set feedback.light")
     names = ", ".join(colour.value for colour in LAMP_COLOURS)
     return Finding("light", "ok", f"{feedback.light} answers; did you see {names}, then dark?")
 
@@ -244,18 +227,14 @@ def check_speaker(loaded: LoadedConfig) -> Finding:
         check=False,
     )
     if done.returncode != 0:
-        said = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no message"]
-        return Finding(
-            "speaker",
-            "fail",
-            f"{sound.device}: {said[-1]}",
-            "set feedback.sound.device to one that `aplay -L` lists",
-        )
+        message = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no message"]
+        remedy = "set feedback.sound.device to one that `aplay -L` lists"
+        return Finding("speaker", "fail", f"{sound.device}: {message[-1]}", remedy)
     return Finding("speaker", "ok", f"{sound.device}: did you hear the chime?")
 
 
 def check_broker(loaded: LoadedConfig) -> Finding:
-    """Connects to the broker, under a name of its own: the service's connection stays."""
+    """Connects to the broker, with a client id of its own: the service's connection stays."""
     mqtt = loaded.config.mqtt
     if not mqtt.enabled:
         return Finding("broker", "skipped", "mqtt.enabled is false")
@@ -269,12 +248,9 @@ def check_broker(loaded: LoadedConfig) -> Finding:
     try:
         connection.open()
     except OSError as error:
-        return Finding(
-            "broker",
-            "warn",  # the crossing is watched all the same
-            f"{mqtt.host}:{mqtt.port}: {' '.join(str(error).split())}",
-            "check mqtt.host, mqtt.port, mqtt.username, mqtt.tls, and that the broker runs",
-        )
+        detail = f"{mqtt.host}:{mqtt.port}: {' '.join(str(error).split())}"
+        remedy = "check mqtt.host, mqtt.port, mqtt.username, mqtt.tls, and that the broker runs"
+        return Finding("broker", "warn", detail, remedy)  # the service works without a broker
     finally:
         connection.close()
     took_ms = (time.perf_counter() - began) * 1e3
@@ -286,9 +262,9 @@ def check_clock(_loaded: LoadedConfig) -> Finding:
     now = dt.datetime.now(dt.timezone.utc)
     text = f"{now:%Y-%m-%d %H:%M} UTC"
     remedy = "timedatectl set-ntp true; is there a network, or a battery for the clock?"
-    if now.year < LEAST_YEAR:
+    if now.year < FIRST_YEAR:
         return Finding("clock", "warn", f"{text}: was never set", remedy)
-    synchronised = _said_by("timedatectl", "show", "--property=NTPSynchronized", "--value")
+    synchronised = _output_of("timedatectl", "show", "--property=NTPSynchronized", "--value")
     if synchronised is None:
         return Finding("clock", "ok", f"{text}; synchronisation unknown (no timedatectl)")
     if synchronised != "yes":
@@ -308,44 +284,29 @@ def check_disk(loaded: LoadedConfig) -> Finding:
     free_mb = shutil.disk_usage(folder).free / MB
     detail = f"{path}: {free_mb:.0f} MB free"
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        return Finding(
-            "disk",
-            "warn",
-            f"{path}: {folder} cannot be written",
-            "set audit.path to a folder that the service may write",
-        )
+        remedy = "set audit.path to a folder that the service may write"
+        return Finding("disk", "warn", f"{path}: {folder} cannot be written", remedy)
     if free_mb < audit.min_free_mb:
-        return Finding(
-            "disk",
-            "warn",
-            f"{detail}, audit.min_free_mb is {audit.min_free_mb:g}: nothing is logged",
-            "make room",
-        )
+        detail += f", audit.min_free_mb is {audit.min_free_mb:g}: nothing is logged"
+        return Finding("disk", "warn", detail, "free disk space")
     full_mb = audit.max_mb * (audit.keep + 1)
     if free_mb - full_mb < audit.min_free_mb and not path.exists():
-        return Finding(
-            "disk",
-            "warn",
-            f"{detail}, the log may grow to {full_mb:.0f} MB",
-            "lower audit.max_mb or audit.keep",
-        )
+        detail += f", the log may grow to {full_mb:.0f} MB"
+        return Finding("disk", "warn", detail, "lower audit.max_mb or audit.keep")
     return Finding("disk", "ok", detail)
 
 
 def check_machine(_loaded: LoadedConfig, zones: Path = Path("/sys/class/thermal")) -> Finding:
     """Temperature, and the Jetson's power mode, as far as they can be read."""
-    hottest = max((t for t in map(_celsius, zones.glob("thermal_zone*/temp"))), default=-math.inf)
-    said = []
-    if math.isfinite(hottest):
-        said.append(f"{hottest:.0f} degrees C")
-    mode = _said_by("nvpmodel", "-q")
-    if mode:
-        said.append(" ".join(mode.split()))
-    if not said:
+    hottest = max(map(_celsius, zones.glob("thermal_zone*/temp")), default=-math.inf)
+    parts = [f"{hottest:.0f} degrees C"] if math.isfinite(hottest) else []
+    parts += [" ".join((_output_of("nvpmodel", "-q") or "").split())]
+    detail = "; ".join(filter(None, parts))
+    if not detail:
         return Finding("machine", "skipped", "temperature and power mode cannot be read here")
     if hottest > HOT_C:
-        return Finding("machine", "warn", "; ".join(said), "give the box shade and air")
-    return Finding("machine", "ok", "; ".join(said))
+        return Finding("machine", "warn", detail, "provide shade and ventilation")
+    return Finding("machine", "ok", detail)
 
 
 def _celsius(file: Path) -> float:
@@ -355,34 +316,33 @@ def _celsius(file: Path) -> float:
         return -math.inf
 
 
-def _said_by(program: str, *arguments: str) -> str | None:
+def _output_of(program: str, *arguments: str) -> str | None:
     """What a program prints; None when it is not there or fails."""
     path = shutil.which(program)
     if path is None:
         return None
+    command = [path, *arguments]
     try:
-        done = subprocess.run(
-            [path, *arguments], capture_output=True, timeout=5, check=False, text=True
-        )
+        done = subprocess.run(command, capture_output=True, timeout=5, check=False, text=True)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _held_by_service(name: str, detail: str, remedy: str) -> Finding:
-    """A device that cannot be had: no failure where it is the running service that has it."""
-    if _said_by("systemctl", "is-active", "bikeped") == "active":
-        return Finding(
-            name, "warn", detail, "the running service may hold it: systemctl stop bikeped"
-        )
+def _device_error(name: str, error: BikepedError) -> Finding:
+    """A device that cannot be opened: only a warning while the running service may hold it."""
+    detail, remedy = _split(str(error))
+    if _output_of("systemctl", "is-active", "bikeped") == "active":
+        remedy = "the running service may hold it: systemctl stop bikeped"
+        return Finding(name, "warn", detail, remedy)
     return Finding(name, "fail", detail, remedy)
 
 
 def _split(message: str) -> tuple[str, str]:
-    """An error's message as what is wrong, and what mends it: they are parted by a semicolon."""
+    """What is wrong and its remedy: a semicolon separates them in the message of an error."""
     detail, _, remedy = " ".join(message.split()).partition("; ")
     return detail, remedy
 
 
-def _left_out(name: str, option: str) -> Callable[[LoadedConfig], Finding]:
+def _skip(name: str, option: str) -> Callable[[LoadedConfig], Finding]:
     return lambda _loaded: Finding(name, "skipped", f"left out by {option}")

@@ -122,7 +122,7 @@ def test_the_demo_end_to_end_in_short(tmp_path, capsys, caplog):
 def test_config_check_and_show(small_config, capsys):
     config = str(small_config())
     assert main(["config", "check", "-c", config]) == 0
-    assert "good; configuration" in capsys.readouterr().out
+    assert "valid; configuration" in capsys.readouterr().out
     assert main(["config", "show", "-c", config, "--set", "camera.fps=25"]) == 0
     assert "fps: 25" in capsys.readouterr().out
     assert main(["config", "schema"]) == 0

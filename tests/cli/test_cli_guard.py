@@ -74,7 +74,7 @@ def test_two_outputs_need_two_files(capsys, tmp_path):
     clip = tmp_path / "clip.avi"
     clip.write_bytes(b"x")
     one = tmp_path / "out.json"
-    assert "is --json, too" in refused(capsys, "replay", clip, "--json", one, "--events", one)
+    assert "is also --json" in refused(capsys, "replay", clip, "--json", one, "--events", one)
     assert not one.exists()
 
 
@@ -146,7 +146,7 @@ def test_the_demo_does_not_write_over_its_configuration_or_its_own_files(capsys,
     assert "is -c" in refused(capsys, "demo", "--out", out, "-c", own, "--seconds", "0.2")
     assert own.read_text() == config.read_text()
     told = refused(capsys, "demo", "--out", out, "--json", out / "events.jsonl")
-    assert "is --out, too" in told
+    assert "is also --out" in told
     assert [p.name for p in out.iterdir()] == ["summary.json"]
 
 

@@ -20,7 +20,7 @@ PATIENCE_S = 20.0
 @pytest.fixture(autouse=True)
 def no_programs(monkeypatch):
     """No system program is asked, unless a test says what it answers."""
-    monkeypatch.setattr(doctor, "_said_by", lambda *command: None)
+    monkeypatch.setattr(doctor, "_output_of", lambda *command: None)
 
 
 class Camera:
@@ -102,7 +102,7 @@ def test_a_missing_camera_fails_with_its_mend(small_config):
 
 
 def test_what_the_running_service_holds_is_a_warning(small_config, monkeypatch):
-    monkeypatch.setattr(doctor, "_said_by", lambda *command: "active")
+    monkeypatch.setattr(doctor, "_output_of", lambda *command: "active")
 
     def busy(*a, **k):
         raise CaptureError("/dev/video0: busy; who uses it?")
@@ -224,7 +224,7 @@ def test_the_clock(year, said, status, small_config, monkeypatch):
             return cls(year, 1, 2, tzinfo=tz)
 
     monkeypatch.setattr(doctor.dt, "datetime", Then)
-    monkeypatch.setattr(doctor, "_said_by", lambda *command: said)
+    monkeypatch.setattr(doctor, "_output_of", lambda *command: said)
     finding = doctor.check_clock(load_config(small_config()))
     assert finding.status == status
     assert str(year) in finding.detail
@@ -257,7 +257,7 @@ def test_temperature_and_power_mode(small_config, tmp_path, monkeypatch):
     for name, text in (("thermal_zone0", "48500\n"), ("thermal_zone1", "no\n")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "temp").write_text(text)
-    monkeypatch.setattr(doctor, "_said_by", lambda *command: "NV Power Mode: 15W\n0\n")
+    monkeypatch.setattr(doctor, "_output_of", lambda *command: "NV Power Mode: 15W\n0\n")
     finding = doctor.check_machine(config, tmp_path)
     assert (finding.status, finding.detail) == ("ok", "48 degrees C; NV Power Mode: 15W 0")
     (tmp_path / "thermal_zone0" / "temp").write_text("91000\n")

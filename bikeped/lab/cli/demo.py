@@ -9,7 +9,7 @@ import click
 
 from bikeped.cli.common import FiniteRange, config_options, json_option, progress_bar, write_json
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.cli.web_options import open_pages, say_where, web_option, web_overrides
+from bikeped.cli.web_options import open_pages, print_address, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
@@ -85,7 +85,7 @@ def command(
             mqtt=False,
             progress=progress,
             pages=pages,
-            serving=say_where,
+            serving=print_address,
         )
     lines = [json.loads(line) for line in events.read_text(encoding="utf-8").splitlines()]
     summary = {
