@@ -32,7 +32,7 @@ class OracleDetector:
 
 
 def clip_detector(sidecar: Path) -> OracleDetector:
-    """Sees in every frame of a drawn clip whoever shows."""
+    """Finds in every frame of a drawn clip all road users that are visible."""
     frames = read_sidecar(sidecar).frames
     return OracleDetector(lambda number: boxes([o for o in frames[number] if o.visible > 0.1]))
 

@@ -219,7 +219,7 @@ class LightDriver:
         return signal, shown_s + self._watchdog_s
 
     def _apply(self, colour: Colour, now_s: float) -> float:
-        """Makes the device show `colour`, if it does not already; returns when to look again."""
+        """Makes the device show `colour`, if it does not already; returns when to check again."""
         if self._retry_at_s is not None and now_s < self._retry_at_s:
             return self._retry_at_s
         if colour == self._applied and 0 <= now_s - self._applied_s < self._assert_s:

@@ -1,4 +1,4 @@
-"""Where frames come from, live or recorded, behind one call: the next frame, please."""
+"""Where frames come from: a live camera or a recording."""
 
 from __future__ import annotations
 
@@ -6,41 +6,57 @@ import asyncio
 import math
 import time
 from collections.abc import Callable
-from typing import Protocol
 
-from bikeped.capture import FrameGrabber, FrameSource
+from bikeped.capture import FrameGrabber, FrameSource, open_source
+from bikeped.config import CameraConfig
 from bikeped.pipeline.worker_threads import WorkerThread
 from bikeped.types import Frame
 
 
-class Feed(Protocol):
-    """A source of frames for the loop."""
+def open_configured(camera: CameraConfig, source: str | None = None) -> FrameSource:
+    """The camera of the configuration, or `source` with its size and rate; raises CaptureError."""
+    return open_source(
+        camera.source if source is None else source,
+        width=camera.width,
+        height=camera.height,
+        fps=camera.fps,
+        fourcc=camera.fourcc,
+    )
 
-    live: bool
+
+class Feed:
+    """A source of frames for the loop. As it stands here, a recording: never late, never hung."""
+
+    live = False
 
     async def next_frame(self) -> tuple[Frame, float] | None:
         """The next frame and how long getting it took in ms; None at the end of a recording."""
+        raise NotImplementedError
 
     def newest_s(self, now_s: float) -> float | None:
         """When the newest frame arrived, on the loop's clock; None before the first."""
+        return None
 
     def dropped(self) -> int:
-        """Frames that were replaced by a newer one before anybody took them."""
+        """Frames that were replaced by a newer one before they were taken."""
+        return 0
 
     def hung_s(self, now_s: float) -> float:
-        """How long a read has not returned."""
+        """How long the read in progress has not returned, in seconds."""
+        return 0.0
 
     def error(self) -> str | None:
         """What is wrong with the source now, in one line."""
+        return None
 
     def restart(self) -> None:
-        """Asks for a fresh source: what this one delivers is of no use."""
+        """Asks for the source to be opened anew: its frames cannot be used."""
 
     async def close(self) -> None:
-        """Gives the source back; takes a bounded time, whatever the source does."""
+        """Closes the source; takes a bounded time, whatever the source does."""
 
 
-class LiveFeed:
+class LiveFeed(Feed):
     """The newest frame of a camera; old ones are dropped and counted."""
 
     live = True
@@ -77,10 +93,8 @@ class LiveFeed:
         await asyncio.to_thread(self._grabber.stop)
 
 
-class RecordedFeed:
-    """Every frame of a recording in order, read one ahead in a thread of its own."""
-
-    live = False
+class RecordedFeed(Feed):
+    """Every frame of a recording in order, read one ahead in a thread."""
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
@@ -91,25 +105,10 @@ class RecordedFeed:
         ahead = self._ahead or self._reader.submit(_timed, self._source.read)
         frame, took_ms = await ahead
         if frame is None:
-            self._ahead = ahead  # asked once more, it is still the end
+            self._ahead = ahead  # the next call gets the end again
             return None
         self._ahead = self._reader.submit(_timed, self._source.read)
         return frame, took_ms
-
-    def newest_s(self, now_s: float) -> float | None:
-        return None
-
-    def dropped(self) -> int:
-        return 0
-
-    def hung_s(self, now_s: float) -> float:
-        return 0.0
-
-    def error(self) -> str | None:
-        return None
-
-    def restart(self) -> None:
-        """Nothing: a recording has but one beginning."""
 
     async def close(self) -> None:
         if self._ahead is not None:

@@ -1,4 +1,4 @@
-"""Where the camera hangs, and what of the ground it sees: geometry alone, as it is configured."""
+"""From detections in pixels to points on the ground, by the configured geometry."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from bikeped.types import Detections, GroundPoints
 class GroundMapper:
     """The configured camera, its framing and its ground table.
 
-    Made from a configuration whose lens, framing and ground do not fit together, it raises
-    `GeometryError`: what starts the service makes it before anything that takes long.
+    Raises GeometryError when lens, framing and ground of the configuration do not fit together.
     """
 
     def __init__(self, loaded: LoadedConfig) -> None:
@@ -35,8 +34,8 @@ class GroundMapper:
             self._framings = {(width, height): known}
         return known
 
-    def ground(self, detections: Detections, frame: Framing) -> tuple[GroundPoints, int]:
-        """Detections on the ground and in range, and how many do not lie on the ground at all."""
+    def to_ground(self, detections: Detections, frame: Framing) -> tuple[GroundPoints, int]:
+        """Ground points within range, and how many detections do not end on the ground."""
         crop = frame.frame_to_crop(detections.bottom_centre_px())
         xy, valid = self.table.lookup(crop)
         near = valid & (np.nan_to_num(np.hypot(xy[:, 0], xy[:, 1]), nan=np.inf) < self._max_range_m)

@@ -1,4 +1,4 @@
-"""Log lines of what may happen thirty times a second for months."""
+"""Log lines of events that may come thirty times a second for months."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 
 class RateLimitedLogger:
-    """Says at most one line a subject every `every_s` seconds, and how many it kept back."""
+    """Logs at most one line a subject every `every_s` seconds, and how many it suppressed."""
 
     def __init__(
         self,
@@ -17,25 +17,25 @@ class RateLimitedLogger:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._log, self._every_s, self._clock = log, every_s, clock
-        self._said: dict[str, tuple[float, int]] = {}
+        self._logged: dict[str, tuple[float, int]] = {}
 
     def warn(self, subject: str, text: str) -> None:
-        """A line of what was expected to happen now and then."""
-        kept = self._due(subject)
-        if kept is not None:
-            self._log.warning("%s%s", text, kept)
+        """A warning of an expected event."""
+        suppressed = self._due(subject)
+        if suppressed is not None:
+            self._log.warning("%s%s", text, suppressed)
 
     def failure(self, subject: str, error: BaseException) -> None:
-        """A line of what nobody expected, with where it came from."""
-        kept = self._due(subject)
-        if kept is not None:
-            self._log.error("%s: %s%s", subject, error, kept, exc_info=error)
+        """An unexpected error, with its traceback."""
+        suppressed = self._due(subject)
+        if suppressed is not None:
+            self._log.error("%s: %s%s", subject, error, suppressed, exc_info=error)
 
     def _due(self, subject: str) -> str | None:
         now_s = self._clock()
-        said_s, kept = self._said.get(subject, (None, 0))
-        if said_s is not None and now_s - said_s < self._every_s:
-            self._said[subject] = (said_s, kept + 1)
+        logged_s, suppressed = self._logged.get(subject, (None, 0))
+        if logged_s is not None and now_s - logged_s < self._every_s:
+            self._logged[subject] = (logged_s, suppressed + 1)
             return None
-        self._said[subject] = (now_s, 0)
-        return f" (and {kept} more since the last such line)" if kept else ""
+        self._logged[subject] = (now_s, 0)
+        return f" (and {suppressed} more since the last such line)" if suppressed else ""

@@ -1,4 +1,4 @@
-"""`replay`: a recording through the very loop that `run` has."""
+"""`replay`: a recording through the loop of `run`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.capture import FrameSource, PacedSource, open_source
+from bikeped.capture import FrameSource, PacedSource
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback import LightDriver, SimulatedLight
 from bikeped.overlay import VideoWriter
 from bikeped.pipeline.application import Application, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector
-from bikeped.pipeline.feed import RecordedFeed
+from bikeped.pipeline.feed import RecordedFeed, open_configured
 from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.loop import Loop
@@ -27,7 +27,6 @@ from bikeped.pipeline.replay_outputs import (
     OVERLAY_SIZE,
     EventFile,
     OverlayVideo,
-    Progress,
     ReplaySummary,
 )
 from bikeped.pipeline.track_and_decide import TrackAndDecide
@@ -38,13 +37,13 @@ log = logging.getLogger(__name__)
 
 #: The percentiles of a replay are those of all its frames, up to this many (nearly an hour).
 LATENCY_FRAMES = 100_000
-#: So many detections tell whether the camera settings fit the recording.
-ENOUGH_DETECTIONS = 20
+#: Fewer detections do not show whether the camera settings fit the recording.
+MIN_DETECTIONS = 20
 
 
 @dataclass(frozen=True)
 class ReplayFiles:
-    """What a replay leaves behind; None leaves it out."""
+    """Files to write; None writes none."""
 
     events: Path | None = None
     overlay: Path | None = None
@@ -52,7 +51,7 @@ class ReplayFiles:
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """What a replay found."""
+    """Figures of one replay."""
 
     summary: ReplaySummary
     times: StageTimes
@@ -101,17 +100,14 @@ def replay(
     pages: Pages | None = None,
     serving: Callable[[str], None] | None = None,
 ) -> ReplayResult:
-    """Runs a recording through the loop; raises BikepedError with one line that says the mend.
+    """Runs a recording through the loop; raises BikepedError with one line and a remedy.
 
     `detector` replaces the configured model; it belongs to the recording. A recording of another
     size than the configured camera's is warned about unless `detector` is given or the configured
     camera made it (`own_camera`).
     `pages` are served while it runs; `serving` gets their address.
     """
-    camera = loaded.config.camera
-    source = open_source(
-        recording, width=camera.width, height=camera.height, fps=camera.fps, fourcc=camera.fourcc
-    )
+    source = open_configured(loaded.config.camera, recording)
     with contextlib.closing(source):
         if source.live:
             raise BikepedError(f"{source.name}: is a camera, not a recording; use bikeped run")
@@ -121,12 +117,11 @@ def replay(
         except GeometryError as error:
             raise GeometryError(f"{loaded.source}: {source.name}: {error}") from error
         warnings = [] if own_camera or detector is not None else _size_warnings(loaded, source)
-        looking = (
-            detector if detector is not None else load_detector_pool(loaded, recorded=not realtime)
-        )
+        if detector is None:
+            detector = load_detector_pool(loaded, recorded=not realtime)
         track_and_decide = TrackAndDecide(
             loaded,
-            cyclist_box_includes_rider=looking.cyclist_box_includes_rider,
+            cyclist_box_includes_rider=detector.cyclist_box_includes_rider,
             ground_mapper=ground_mapper,
         )
         return asyncio.run(
@@ -134,10 +129,10 @@ def replay(
                 loaded,
                 PacedSource(source) if realtime else source,
                 track_and_decide,
-                looking,
+                detector,
                 files,
                 mqtt and loaded.config.mqtt.enabled,
-                [] if progress is None else [Progress(progress)],
+                progress,
                 warnings,
                 pages,
                 serving,
@@ -152,14 +147,14 @@ async def _replay(
     detector: FrameDetector,
     files: ReplayFiles,
     mqtt: bool,
-    outputs: list[FrameResultListener],
+    progress: Callable[[int], None] | None,
     warnings: list[str],
     pages: Pages | None,
     serving: Callable[[str], None] | None,
 ) -> ReplayResult:
-    summary = ReplaySummary()
+    summary = ReplaySummary(progress or (lambda frames: None))
     async with contextlib.AsyncExitStack() as stack:
-        outputs = [summary, *outputs]
+        outputs: list[FrameResultListener] = [summary]
         if files.events is not None:
             header = new_event_header(loaded, detector)
             outputs.append(stack.enter_context(EventFile(files.events, header)))
@@ -235,7 +230,7 @@ def _size_warnings(loaded: LoadedConfig, source: FrameSource) -> list[str]:
 
 
 def _ground_warnings(loaded: LoadedConfig, summary: ReplaySummary) -> list[str]:
-    if summary.detections < ENOUGH_DETECTIONS or 2 * summary.not_on_ground <= summary.detections:
+    if summary.detections < MIN_DETECTIONS or 2 * summary.not_on_ground <= summary.detections:
         return []
     text = (
         f"{summary.not_on_ground} of {summary.detections} detections end above the horizon or "
@@ -248,13 +243,13 @@ def _ground_warnings(loaded: LoadedConfig, summary: ReplaySummary) -> list[str]:
 
 @contextlib.contextmanager
 def _stop_on_signals(loop: Loop) -> Iterator[None]:
-    """SIGTERM and Ctrl-C end a replay after the frame in hand, with whole files."""
+    """SIGTERM and Ctrl-C end a replay after the current frame, with whole files."""
     running = asyncio.get_running_loop()
     numbers = (signals.SIGTERM, signals.SIGINT)
     try:
         for number in numbers:
             running.add_signal_handler(number, loop.stop)
-    except (RuntimeError, ValueError):  # not the main thread: nobody to signal
+    except (RuntimeError, ValueError):  # not the main thread: no signals
         yield
         return
     try:

@@ -1,4 +1,4 @@
-"""What a replay leaves behind: the summary, the event file, the overlay video."""
+"""What a replay writes: the summary, the event file, the overlay video."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ OVERLAY_SIZE = (1600, 720)
 
 @dataclass
 class ReplaySummary:
-    """What a replay adds up: states, kinds, alert episodes."""
+    """Totals of a replay; `progress` is called with the number of frames so far."""
 
+    progress: Callable[[int], None] = lambda frames: None
+    frames: int = 0
     states: dict[str, int] = field(default_factory=dict)
     tracks: dict[str, set[int]] = field(default_factory=dict)
     detections: int = 0
@@ -37,6 +39,7 @@ class ReplaySummary:
 
     async def on_frame_result(self, result: FrameResult) -> None:
         frame, tracking = result.decoded.frame, result.tracking
+        self.frames += 1
         self.duration_s = result.t_s
         self.detections += len(result.detections)
         self.not_on_ground += tracking.not_on_ground
@@ -56,6 +59,7 @@ class ReplaySummary:
             )
         elif change == "lasts":
             self.alerts[-1]["frames"] += 1
+        self.progress(self.frames)
 
 
 class EventFile:
@@ -82,7 +86,7 @@ class EventFile:
 
 
 class OverlayVideo:
-    """The overlay video of a replay: drawn in a thread, while the next frame is looked at."""
+    """The overlay video of a replay: drawn in a thread while the next frame is detected."""
 
     def __init__(self, writer: VideoWriter, track_and_decide: TrackAndDecide) -> None:
         self._writer, self._track_and_decide = writer, track_and_decide
@@ -110,24 +114,13 @@ class OverlayVideo:
         self._drawing = asyncio.create_task(asyncio.to_thread(draw))
 
     async def wait(self) -> None:
-        """Until the frame in hand is drawn; raises what went wrong."""
+        """Waits until the current frame is drawn; raises the error of drawing."""
         task = self._drawing
         if task is None:
             return
         try:
-            # Who is told to stop meanwhile leaves the thread at it: the next one must wait, too.
+            # A cancelled caller leaves the thread drawing: the next caller must wait for it, too.
             await asyncio.shield(task)
         finally:
             if task.done():
                 self._drawing = None
-
-
-class Progress:
-    """Tells how many frames are done."""
-
-    def __init__(self, tell: Callable[[int], None]) -> None:
-        self._tell, self._frames = tell, 0
-
-    async def on_frame_result(self, result: FrameResult) -> None:
-        self._frames += 1
-        self._tell(self._frames)

@@ -1,4 +1,4 @@
-"""`run`: the service, from the first FAULT on the light to the last dark."""
+"""`run`: the service, from FAULT at the start to a dark light at the end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from bikeped import __version__
-from bikeped.capture import FrameGrabber, FrameSource, PacedSource, open_source
+from bikeped.capture import FrameGrabber, FrameSource, PacedSource
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
@@ -21,7 +21,7 @@ from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import Application, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
-from bikeped.pipeline.feed import LiveFeed
+from bikeped.pipeline.feed import LiveFeed, open_configured
 from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
@@ -42,12 +42,11 @@ LOADING = Fault("starting", "service.starting", "loading the model")
 def run_service(
     loaded: LoadedConfig, *, detector: FrameDetector | None = None, pages: Pages | None = None
 ) -> int:
-    """The service until SIGTERM or SIGINT; its exit status: 0, or that of the fault that ended it.
+    """Runs until SIGTERM or SIGINT; returns the exit status: 0, or that of the fault that ended it.
 
-    `pages` is what `web` serves; None serves nothing.
-
-    Raises BikepedError for what only a person can mend. A thread that hangs is left behind, so the
-    caller should end the process without joining threads (see `bikeped.cli.run`).
+    `pages` are served; None serves nothing. Raises BikepedError for what needs a person. A thread
+    that hangs is left behind, so the caller should end the process without joining threads (see
+    `bikeped.cli.run`).
     """
     return asyncio.run(_run(loaded, detector, pages))
 
@@ -72,8 +71,8 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
     notifier = Notifier()
     async with contextlib.AsyncExitStack() as last:
         last.callback(notifier.close)
-        light.start()  # FAULT until told otherwise
-        # The last act, whatever ends the service.
+        light.start()  # shows FAULT until the first signal
+        # Done last, whatever ends the service.
         last.push_async_callback(_darken, light)
         if detector is None:
             detector = await _load_while_alive(loaded, light, notifier, stop)
@@ -147,21 +146,14 @@ async def _serve(
     finally:
         notifier.stopping()
         stopping.cancel()
-        # Stopping the rest may take seconds, in which the light must not look unattended.
+        # Stopping the rest may take seconds: keeps the light's watchdog from tripping.
         last.callback(asyncio.create_task(_refresh(application.dispatcher)).cancel)
         log.info("latency\n%s", application.telemetry.times.table())
     return 0
 
 
 def _open_camera(loaded: LoadedConfig) -> FrameSource:
-    camera = loaded.config.camera
-    source = open_source(
-        camera.source,
-        width=camera.width,
-        height=camera.height,
-        fps=camera.fps,
-        fourcc=camera.fourcc,
-    )
+    source = open_configured(loaded.config.camera)
     # A recording in the camera's place is played at its own pace, as a rehearsal.
     return source if source.live else PacedSource(source)
 
@@ -171,8 +163,8 @@ async def _load_while_alive(
 ) -> FrameDetector | None:
     """Loads the model in a thread (an engine may take minutes to build), showing FAULT meanwhile.
 
-    None when the service was asked to stop before. Past LOAD_LIMIT_S systemd is no longer asked for
-    patience, and ends the process.
+    None when the service is stopped before. After LOAD_LIMIT_S systemd is no longer asked for more
+    time, and ends the process.
     """
     starting = fault_signal((LOADING,), loaded.config.feedback.fault_blink_hz)
     worker = WorkerThread("load")

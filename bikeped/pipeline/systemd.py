@@ -48,5 +48,5 @@ class Notifier:
             return
         try:
             self._socket.sendto(message.encode(), self._address)
-        except OSError as error:  # never a reason to stop watching the crossing
+        except OSError as error:  # never a reason to stop the service
             log.debug("systemd: %s", error)

@@ -58,7 +58,7 @@ class Telemetry:
         self._shown: tuple[str, tuple[Fault, ...]] | None = None
         self._next_tracks_s = -math.inf
         self._started_s = clock()
-        self._recent: deque[float] = deque(maxlen=240)  # when frames were judged
+        self._recent: deque[float] = deque(maxlen=240)  # when results came
         self._last: FrameResult | None = None
         self._signal: Signal | None = None
 
@@ -105,7 +105,7 @@ class Telemetry:
         self._mqtt.publish("state", encode(message), retain=True, qos=self._loaded.config.mqtt.qos)
 
     def fps(self) -> float:
-        """Frames judged per second, over the last two seconds."""
+        """Frames processed per second, over the last two seconds."""
         now_s = self._clock()
         return sum(now_s - at_s <= 2.0 for at_s in self._recent) / 2.0
 

@@ -1,7 +1,7 @@
 """From detections to a decision: ground, track, predict, decide.
 
-The pole and a replay both run this class. Frames bring their own time; the clock is read only to
-tell how long the stages took, and there is no I/O.
+Run by the device, by a replay and by the lab. Frames bring their own time; the clock is read only
+to measure the stages. No I/O.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """What one frame led to; `track_ms` and `decide_ms` are how long that took.
+    """Tracks and decision of one frame, and the milliseconds that they took.
 
-    `not_on_ground` detections end above the horizon or outside the image circle: a few are
-    reflections and hoardings, most of them are a camera that hangs otherwise than configured.
+    `not_on_ground` counts detections that end above the horizon or outside the image circle: a few
+    are reflections and hoardings; many mean a camera that is mounted otherwise than configured.
     """
 
     points: GroundPoints
@@ -34,7 +34,7 @@ class TrackingResult:
 
 
 class TrackAndDecide:
-    """Judges frames in order of their capture times."""
+    """The ground, tracking and decision stages, for frames in order of their capture times."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class TrackAndDecide:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets all tracks and memories, as when a recording starts anew."""
+        """Forgets all tracks and decisions, as when a recording starts anew."""
         self.tracker = Tracker(self._tracker_settings, self._speed_window_s, self._history)
         self._decider = Decider(self._rule)
         self._last_s = -math.inf
@@ -71,12 +71,12 @@ class TrackAndDecide:
     ) -> TrackingResult:
         """Tracks and decides a frame of `width` x `height` captured at `captured_s`.
 
-        `age_s` is how old the frame is now; the latency section says what is made of it. Capture
-        times must increase: a frame that is not newer than the last one is a ValueError.
+        `age_s` is the frame's age now, compensated as section `latency` says. ValueError when
+        `captured_s` is not later than that of the last frame.
         """
         began = time.perf_counter()
-        view = self.ground_mapper
-        points, not_on_ground = view.ground(detections, view.framing_for(width, height))
+        mapper = self.ground_mapper
+        points, not_on_ground = mapper.to_ground(detections, mapper.framing_for(width, height))
         return self.update_from_points(points, captured_s, age_s, not_on_ground, began)
 
     def update_from_points(
@@ -111,7 +111,7 @@ class TrackAndDecide:
         )
 
     def _ahead(self, tracks: Tracks, age_s: float) -> FloatArray:
-        """Positions where the tracks are by now, as far as the configuration asks for it."""
+        """Positions [n, 2] in metres that the rule uses: predicted ahead if so configured."""
         latency = self._latency
         if latency.compensation == "off":
             return tracks.xy_m

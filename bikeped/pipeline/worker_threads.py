@@ -22,7 +22,7 @@ _Job = tuple["concurrent.futures.Future[Any]", Callable[[], Any]]
 
 
 class WorkerThread:
-    """One daemon thread that runs calls one after another, and knows for how long it has."""
+    """One daemon thread that runs calls one after another and measures the one in progress."""
 
     def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -40,12 +40,12 @@ class WorkerThread:
         return asyncio.wrap_future(future)
 
     def busy_s(self, now_s: float) -> float:
-        """For how long the call under way has not returned; 0 when there is none."""
+        """Seconds since the call in progress began; 0 when there is none."""
         since_s = self._busy_since_s
         return 0.0 if since_s is None else max(0.0, now_s - since_s)
 
     async def close(self, timeout_s: float = 2.0) -> bool:
-        """Ends the thread after the calls that wait; False when it hangs and is left behind."""
+        """Ends the thread after its queued calls; False when it hangs and is left behind."""
         self._jobs.put(None)
         await asyncio.to_thread(self._thread.join, timeout_s)
         return not self._thread.is_alive()
@@ -58,12 +58,12 @@ class WorkerThread:
             self._busy_since_s = self._clock()
             try:
                 result = call()
-            except BaseException as error:  # noqa: BLE001 - it belongs to whoever awaits it
+            except BaseException as error:  # noqa: BLE001 - it belongs to the caller
                 self._busy_since_s = None
                 future.set_exception(error)
             else:
                 self._busy_since_s = None
                 future.set_result(result)
                 del result
-            # Nothing of a call, a picture above all, is kept while waiting for the next one.
+            # Frees the call with its frame before waiting for the next one.
             del future, call, job

@@ -1,4 +1,4 @@
-"""Fakes at the seams of the loop: a feed, an detector, a light, a clock, and one who listens."""
+"""Fakes for the loop: a feed, a detector, a light, a clock, and a recorder."""
 
 from __future__ import annotations
 

@@ -291,10 +291,10 @@ class PatientDetector(FakeDetector):
         return answer
 
 
-async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
+async def test_the_waiting_frame_is_detected_while_one_is_processed(monkeypatch):
     rig = Rig(live=False)
     rig.detector = detector = PatientDetector()
-    judged: list[int] = []
+    processed: list[int] = []
 
     class Watched(LatestFrameSlot):
         def put(self, item: DecodedFrame | None) -> None:
@@ -307,9 +307,9 @@ async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
         """Takes an result only when the detector has begun with the next frame."""
 
         async def on_frame_result(self, result: FrameResult) -> None:
-            judged.append(result.decoded.frame.number)
+            processed.append(result.decoded.frame.number)
             deadline = asyncio.get_running_loop().time() + PATIENCE_S
-            while judged[-1] < 9 and detector.calls < judged[-1] + 2:
+            while processed[-1] < 9 and detector.calls < processed[-1] + 2:
                 assert asyncio.get_running_loop().time() < deadline
                 await asyncio.sleep(0)
 
@@ -318,11 +318,11 @@ async def test_what_waits_is_looked_at_while_a_frame_is_judged(monkeypatch):
     rig.recorded(10)
     async with rig:
         await rig.ended()
-    assert judged == list(range(10))
+    assert processed == list(range(10))
 
 
 class PairedDetector(FakeDetector):
-    """Answers only when two look at once, about the later frame first."""
+    """Answers only when two frames are in flight, the later one first."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -342,7 +342,7 @@ class PairedDetector(FakeDetector):
 
 
 @pytest.mark.parametrize("count", [8, 10])
-async def test_two_looks_at_once_are_judged_in_order(count):
+async def test_two_frames_in_flight_are_processed_in_order(count):
     rig = Rig(live=False)
     rig.detector = PairedDetector()
     rig.max_inflight = 2
@@ -352,7 +352,7 @@ async def test_two_looks_at_once_are_judged_in_order(count):
     assert [o.decoded.frame.number for o in rig.recorder.results] == list(range(count))
 
 
-async def test_the_second_of_two_looks_fails_after_the_first_is_judged():
+async def test_the_second_of_two_in_flight_fails_after_the_first_is_processed():
     rig = Rig(live=False)
     rig.detector = PairedDetector()
     rig.detector.error = DetectorError("out of memory")
@@ -361,18 +361,18 @@ async def test_the_second_of_two_looks_fails_after_the_first_is_judged():
     async with rig:
         with pytest.raises(DetectorError, match="out of memory"):
             await rig.ended()
-        rig.detector.both.abort()  # whoever looks now
+        rig.detector.both.abort()  # releases the waiting thread
     assert [o.decoded.frame.number for o in rig.recorder.results] == [0, 1, 2, 3, 4]
 
 
-async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
+async def test_a_detection_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
     rig = Rig(live=False)
-    judged: list[int] = []
+    processed: list[int] = []
 
     class Output:
         async def on_frame_result(self, result: FrameResult) -> None:
-            judged.append(result.decoded.frame.number)
-            if len(judged) == 3:
+            processed.append(result.decoded.frame.number)
+            if len(processed) == 3:
                 rig.detector.error = DetectorError("out of memory")
 
     rig.outputs.append(Output())
@@ -380,14 +380,17 @@ async def test_a_look_that_fails_meanwhile_costs_a_replay_no_frame_before_it():
     async with rig:
         with pytest.raises(DetectorError, match="out of memory"):
             await rig.ended()
-    assert judged in ([0, 1, 2], [0, 1, 2, 3])  # the look after the third may have begun already
+    assert processed in (
+        [0, 1, 2],
+        [0, 1, 2, 3],
+    )  # the detection after the third may have begun already
     assert rig.light.shown[-1].name == "OFF"
 
 
-@pytest.mark.parametrize("looks", [1, 2])
-async def test_frames_before_one_of_other_proportions_are_judged(looks):
+@pytest.mark.parametrize("max_inflight", [1, 2])
+async def test_frames_before_one_of_other_proportions_are_processed(max_inflight):
     rig = Rig(live=False)
-    rig.max_inflight = looks
+    rig.max_inflight = max_inflight
     rig.recorded(6, ends=False)
     rig.feed.put(6 / 30, width=64, height=96, rgb=np.zeros((96, 64, 3), np.uint8))
     async with rig:
@@ -396,7 +399,7 @@ async def test_frames_before_one_of_other_proportions_are_judged(looks):
     assert [o.decoded.frame.number for o in rig.recorder.results] == list(range(6))
 
 
-async def test_an_output_that_fails_while_the_eye_hangs_ends_a_replay():
+async def test_an_output_that_fails_while_the_detector_hangs_ends_a_replay():
     rig = Rig(live=False)
 
     class Output:

@@ -1,4 +1,4 @@
-"""WorkerThread, limited_log log lines, feeds, vision: the small parts that the loop stands on."""
+"""Worker threads, rate-limited log lines, feeds, decoding and systemd messages."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ async def test_a_recorded_feed_gives_every_frame_and_then_the_end(make_clip):
 
 
 class Slow:
-    """A source whose read returns when it is told to."""
+    """A source whose read returns when `go` is set."""
 
     name, width, height, fps, live = "slow", 96, 64, 30.0, True
 

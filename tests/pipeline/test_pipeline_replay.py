@@ -66,7 +66,7 @@ def test_the_realtime_replay_decides_the_same(make_clip, small_config, tmp_path)
     assert views[0] == views[1]
 
 
-def test_a_real_model_decodes_looks_and_says_safe(make_clip, small_config, tmp_path):
+def test_a_real_model_decodes_detects_and_says_safe(make_clip, small_config, tmp_path):
     clip = make_clip("c.avi", 12)
     events, overlay = tmp_path / "e.jsonl", tmp_path / "o.mp4"
     result = replay(load_config(small_config(clip)), str(clip), files=ReplayFiles(events, overlay))
@@ -128,7 +128,7 @@ def test_other_proportions_are_refused_with_both_files_named(make_clip, small_co
         replay(loaded, str(clip), detector=FakeDetector())
 
 
-def test_a_scaled_copy_is_said_once_with_the_mend(make_clip, small_config, caplog):
+def test_a_scaled_copy_is_said_once_with_the_remedy(make_clip, small_config, caplog):
     clip = make_clip("c.avi", 9)
     loaded = load_config(
         small_config(clip), ["camera.width=192", "camera.height=128", "camera.radius_px=116"]
@@ -176,7 +176,7 @@ def test_a_camera_is_no_recording(small_config, monkeypatch):
         def close(self):
             pass
 
-    monkeypatch.setattr("bikeped.pipeline.replay.open_source", lambda *a, **k: Camera())
+    monkeypatch.setattr("bikeped.pipeline.feed.open_source", lambda *a, **k: Camera())
     with pytest.raises(BikepedError, match="bikeped run"):
         replay(load_config(small_config()), "/dev/video0", detector=FakeDetector())
 

@@ -162,7 +162,7 @@ def test_a_missing_camera_is_a_fault_and_not_the_end(start, small_config):
         ),
     ],
 )
-def test_what_only_a_person_can_mend_ends_with_2_and_one_line(start, small_config, options, said):
+def test_what_needs_a_person_ends_with_2_and_one_line(start, small_config, options, said):
     service = start(small_config(), *[part for o in options for part in ("--set", o)])
     assert service.wait() == 2
     (line,) = [line for line in service.lines if line.startswith("bikeped: ")]

@@ -1,4 +1,4 @@
-"""The track_and_decide: from detections to a decision, as the pole and a replay have it."""
+"""Tracking and decision: from detections to a decision, as the device and a replay run it."""
 
 from __future__ import annotations
 
