@@ -1,4 +1,4 @@
-// The camera's numbers: for each a figure, a slider, two buttons, and what it does at 10 m.
+// The camera's values: for each a number field, a slider, two buttons, and the effect at 10 m.
 
 import { FIRST, HINTS, NAMES, rounded, sign, unitOf } from "/static/align-words.js";
 import { $, el, setText } from "/static/ui.js";
@@ -12,7 +12,7 @@ export class Dials {
     this.rows = new Map();
   }
 
-  // Rows for what /align/state says of each number, at their first values.
+  // Rows for the `fields` of /align/state, with their first values.
   make(fields, values) {
     for (const [key, value] of Object.entries(values)) this.values[key] = rounded(key, value);
     for (const field of fields) this.row(field);
@@ -82,7 +82,7 @@ export class Dials {
     }
   }
 
-  // What one step of each does to a mark at 10 m; null: 10 m is not in view.
+  // The effect of one step of each value on a mark at 10 m; null: 10 m is not in view.
   showEffects(ten) {
     for (const [key, { effect }] of this.rows) {
       const moves = ten && ten.steps[key];

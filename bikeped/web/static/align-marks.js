@@ -1,4 +1,4 @@
-// The list of marks and of distances between them: rows of inputs that stay while their texts change.
+// The list of marks and of distances between them; a row's inputs stay while its texts change.
 
 import { $, el, setText } from "/static/ui.js";
 

@@ -1,4 +1,4 @@
-// Drawing of the picture, the grid and what belongs to the marks, at any scale: stage and loupe alike.
+// Draws the picture, the grid and the marks' measured positions, at any scale: for stage and loupe.
 
 import { circle, line } from "/static/canvas.js";
 
@@ -66,7 +66,7 @@ function drawLabels(view, context, at) {
   }
 }
 
-// The optical centre, what read 10 m before, and where each measurement would lie.
+// The optical centre, the pixel that read 10 m before, and the measured position of each mark.
 function drawPoints(view, context, at) {
   const ring = (point, radius, colour) => {
     circle(context, at(point), radius, { stroke: DARK, width: 5 });

@@ -1,10 +1,10 @@
-// The picture with the grid and the marks: zoom, pan, drag, draw. It knows pixels, no metres and no
-// lens: all lines come from the box. Frame pixel (u, v) has its middle at the integer.
+// The picture with the grid and the marks: zoom, pan, drag, draw. It has no lens model: all lines come
+// from the server, in frame pixels. The centre of pixel (u, v) is at the integers.
 
 import { drawLoupe, drawScene } from "/static/align-paint.js";
 import { canvasOf, el, svg } from "/static/ui.js";
 
-const TAP_PX = 8; // a finger that moves less has not moved
+const TAP_PX = 8; // a pointer that moves less taps
 
 export class View {
   // `on`: tap(u, v), moved(mark), chosen(mark), removed(mark), entered(mark)
@@ -41,7 +41,7 @@ export class View {
     });
   }
 
-  // Shows a picture; the view stays where it is when the size is the same.
+  // Shows a picture; zoom and position stay when the size is the same.
   async setPicture(blob) {
     const full = await createImageBitmap(blob, { imageOrientation: "none" });
     const levels = [full];
@@ -78,7 +78,7 @@ export class View {
     return Math.min(this.width / this.size.width, this.height / this.size.height);
   }
 
-  // All of it on a wide screen; a narrow one is filled; on a phone the ground is what matters.
+  // The whole picture on a wide screen, filled on a narrow one, the ground on a phone.
   start() {
     if (!this.width) return;
     const fill = Math.max(this.width / this.size.width, this.height / this.size.height);
@@ -130,7 +130,7 @@ export class View {
     this.keep();
   }
 
-  // Some of the picture always stays in sight.
+  // Part of the picture always stays in view.
   keep() {
     const w = this.size.width * this.scale, h = this.size.height * this.scale;
     this.left = Math.min(Math.max(this.left, 0.5 * this.width - w), 0.5 * this.width);
@@ -138,7 +138,7 @@ export class View {
     this.repaint();
   }
 
-  // Brings a mark into sight.
+  // Brings a mark into view.
   reveal(mark) {
     const [x, y] = this.toStage(mark.u, mark.v);
     const out = x < 24 || y < 24 || x > this.width - 24 || y > this.height - 24;
@@ -173,7 +173,7 @@ export class View {
       pin.setAttribute("aria-label", `Mark ${mark.name}${mark.says ? `, ${mark.says}` : ""}`);
       pin.setAttribute("aria-pressed", String(Boolean(mark.chosen)));
       pin.classList.toggle("off", Boolean(mark.off));
-      // On a small screen only the chosen mark says what it reads.
+      // On a small screen only the chosen mark shows its reading.
       pin.lastChild.textContent = mark.chosen || this.width > 640 ? mark.tag ?? mark.name : mark.name;
     }
     this.repaint();
@@ -200,8 +200,8 @@ export class View {
   listen() {
     const { stage } = this;
     const fingers = new Map();
-    let held = null; // the mark under a finger
-    let still = false; // whether the finger may still be tapping
+    let held = null; // the mark that is dragged
+    let still = false; // whether the pointer has not moved yet
     const point = (event) => {
       const box = stage.getBoundingClientRect();
       return [event.clientX - box.left, event.clientY - box.top];

@@ -1,4 +1,4 @@
-// What people read: names, units, figures with a true minus sign.
+// Names, units, and numbers with a true minus sign.
 
 export const NAMES = {
   height_m: ["Height", "m", 4],

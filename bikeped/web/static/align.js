@@ -1,4 +1,4 @@
-// The align page: numbers, marks, fit, save. What any of it means on the ground the box works out.
+// The align page: camera values, marks, fit, save. The server computes everything on the ground.
 
 import { Dials } from "/static/align-dials.js";
 import { fitAnswer } from "/static/align-fit.js";
@@ -8,8 +8,8 @@ import { View } from "/static/align-view.js";
 import { NAMES, rounded, sign } from "/static/align-words.js";
 import { $, announce, download, el, metres, request, setText, toast } from "/static/ui.js";
 
-let box = null; // what /align/state said
-let before = null; // the numbers before the last fit
+let state = null; // the answer of /align/state
+let before = null; // the values before the last fit
 let marks = [];
 let between = [];
 let chosen = null;
@@ -44,35 +44,32 @@ function changed() {
   redraw();
 }
 
-// --- the grid: one question under way, the newest numbers next; an answer is never older than the
-// one before it, and one that was overtaken while a question waits is replaced at once
+// --- the grid: one request at a time; changes during a request cause one more with the newest values
 
-let asking = false;
-let again = false;
+let requesting = false;
+let outdated = false;
 
 async function redraw() {
-  if (!view.size || !box) return;
-  if (asking) {
-    again = true;
-    return;
-  }
-  asking = true;
-  do {
-    again = false;
+  if (!view.size || !state) return;
+  outdated = true;
+  if (requesting) return;
+  requesting = true;
+  while (outdated) {
+    outdated = false;
     try {
       const answer = await request("/align/grid", { json: { values: dials.values, frame: view.size, marks: marks.map(asPoint) } });
-      trouble("");
+      showTrouble("");
       view.setGrid(answer.grid, answer.at_10m && answer.at_10m.pixel);
       showTen(answer.at_10m);
       showReadings(answer.marks);
     } catch (error) {
-      trouble(error.message);
+      showTrouble(error.message);
     }
-  } while (again);
-  asking = false;
+  }
+  requesting = false;
 }
 
-function trouble(text) {
+function showTrouble(text) {
   const place = $("#trouble");
   setText(place, text);
   place.hidden = !text;
@@ -138,8 +135,13 @@ function addMark(u, v, more = {}) {
   choose(mark);
   list.showBetween(between, marks);
   marksMoved();
-  if (!more.name) announce(`Mark ${mark.name} set. Its distance is asked for under Marks.`);
-  return mark;
+  if (!more.name) announce(`Mark ${mark.name} set. Enter its distance under Marks.`);
+}
+
+function replaceMarks(newMarks, newBetween) {
+  [marks, between, chosen] = [newMarks, newBetween, null];
+  list.showBetween(between, marks);
+  showMarks();
 }
 
 function removeMark(mark) {
@@ -181,30 +183,26 @@ function points() {
 
 function showWants() {
   const without = marks.filter((mark) => !(mark.distance_m > 0)).map((mark) => mark.name);
-  const wants = [];
-  if (without.length && marks.length) wants.push(`No distance yet, so left out: mark ${without.join(", ")}.`);
-  setText($("#fit-wants"), wants.join(" "));
+  setText($("#fit-wants"), without.length ? `Left out, because no distance is given: mark ${without.join(", ")}.` : "");
   $("#fit").disabled = without.length === marks.length || free.size === 0;
 }
 
-// Marks outlive a reload: a phone drops pages from its memory.
-const SHELF = "bikeped-align";
+// Marks are kept across a reload: a phone drops pages from its memory.
+const STORAGE_KEY = "bikeped-align";
 
 function remember() {
   try {
-    localStorage.setItem(SHELF, JSON.stringify({ size: view.size, marks: marks.map((mark) => ({ id: mark.id, ...asPoint(mark) })), between }));
-  } catch { /* not remembered, then */ }
+    localStorage.setItem(STORAGE_KEY, JSON.stringify({ size: view.size, marks: marks.map((mark) => ({ id: mark.id, ...asPoint(mark) })), between }));
+  } catch { /* storage is off: marks are not kept */ }
 }
 
 function recall() {
   try {
-    const kept = JSON.parse(localStorage.getItem(SHELF));
+    const kept = JSON.parse(localStorage.getItem(STORAGE_KEY));
     if (!kept || kept.size.width !== view.size.width || kept.size.height !== view.size.height) return;
-    marks = kept.marks.filter((mark) => Number.isFinite(mark.u) && Number.isFinite(mark.v));
-    between = kept.between ?? [];
-    list.showBetween(between, marks);
+    replaceMarks(kept.marks.filter((mark) => Number.isFinite(mark.u) && Number.isFinite(mark.v)), kept.between ?? []);
     if (marks.length) toast(`${marks.length} mark${marks.length > 1 ? "s" : ""} from before.`);
-  } catch { marks = []; between = []; }
+  } catch { replaceMarks([], []); }
 }
 
 // --- fit
@@ -231,27 +229,27 @@ async function fit() {
 
 function differing() {
   return Object.keys(NAMES).filter((key) => key in dials.values
-    && Math.abs(dials.values[key] - rounded(key, box.filed[key])) > 0.5 * 10 ** -NAMES[key][2]);
+    && Math.abs(dials.values[key] - rounded(key, state.filed[key])) > 0.5 * 10 ** -NAMES[key][2]);
 }
 
 function showChanges() {
   const keys = differing();
   $("#changes tbody").replaceChildren(...keys.map((key) => el("tr", {},
     el("th", { scope: "row" }, `camera.${key}`),
-    el("td", { class: "number" }, `${rounded(key, box.filed[key])}`), el("td", { class: "number" }, el("b", {}, `${dials.values[key]}`)))));
+    el("td", { class: "number" }, `${rounded(key, state.filed[key])}`), el("td", { class: "number" }, el("b", {}, `${dials.values[key]}`)))));
   $("#changes").hidden = keys.length === 0;
   $("#no-changes").hidden = keys.length > 0;
-  $("#save").disabled = keys.length === 0 || box.cannot_save !== null;
+  $("#save").disabled = keys.length === 0 || state.cannot_save !== null;
   $("#by-hand").hidden = keys.length === 0;
-  $("#by-hand").open = box.cannot_save !== null;
+  $("#by-hand").open = state.cannot_save !== null;
   setText($("#yaml"), `camera:\n${keys.map((key) => `  ${key}: ${dials.values[key]}\n`).join("")}`);
 }
 
 function showFile() {
-  setText($("#file"), box.source.split("/").pop());
+  setText($("#file"), state.source.split("/").pop());
   const place = $("#save-why");
-  const differs = Object.keys(NAMES).some((key) => Math.abs(box.running[key] - box.filed[key]) > 1e-3);
-  const why = box.cannot_save ?? (differs && box.live ? "The running service still has other numbers than the file: it reads the file when it starts." : differs ? "--set gives other numbers than the file has." : "");
+  const differs = Object.keys(NAMES).some((key) => Math.abs(state.running[key] - state.filed[key]) > 1e-3);
+  const why = state.cannot_save ?? (differs && state.live ? "The running service has other values than the file: it reads the file when it starts." : differs ? "--set gives other values than the file." : "");
   setText(place, why);
   place.hidden = !why;
 }
@@ -260,14 +258,14 @@ async function save() {
   const button = $("#save"), place = $("#saved");
   button.disabled = true;
   try {
-    const answer = await request("/align/save", { json: { values: Object.fromEntries(differing().map((key) => [key, dials.values[key]])), sha256: box.sha256 } });
-    box = await request("/align/state");
+    const answer = await request("/align/save", { json: { values: Object.fromEntries(differing().map((key) => [key, dials.values[key]])), sha256: state.sha256 } });
+    state = await request("/align/state");
     showFile();
     place.replaceChildren(
       el("p", { class: "verdict ok-mark" }, `Saved into ${answer.config}.`),
       el("p", { class: "note" }, "The file before: ", el("code", {}, answer.backup.split("/").pop()), "."),
-      answer.restart ? el("p", {}, "The service takes it when it starts anew: ", el("code", {}, "sudo systemctl restart bikeped")) : null,
-      answer.promoted ? el("p", { class: "warn" }, "The promoted decision was measured with the camera as it was: run ", el("code", {}, "bikeped conformance gate"), " again.") : null);
+      answer.restart ? el("p", {}, "The service reads it after a restart: ", el("code", {}, "sudo systemctl restart bikeped")) : null,
+      answer.promoted ? el("p", { class: "warn" }, "The promoted decision was measured with the camera’s previous values: run ", el("code", {}, "bikeped conformance gate"), " again.") : null);
   } catch (error) {
     place.replaceChildren(el("p", { class: "error" }, error.message),
       error.status === 409 ? el("button", { type: "button", onclick: () => location.reload() }, "Open the page again") : null);
@@ -298,18 +296,12 @@ async function newPicture() {
   }
 }
 
-function exportMarks() {
-  const text = `${JSON.stringify(points(), null, 2)}\n`;
-  download(text, "points.json", "application/json");
-}
-
 async function importMarks(file) {
   try {
     const data = JSON.parse(await file.text());
     const share = view.size.width / data.frame.width;
     if (Math.abs(view.size.height / data.frame.height - share) > 0.01) throw new Error("it is for pictures of other proportions");
-    marks = [];
-    between = [];
+    replaceMarks([], []);
     for (const mark of data.marks.slice(0, 40)) addMark(mark.u * share, mark.v * share, { ...mark, name: String(mark.name) });
     const id = (name) => marks.find((mark) => mark.name === name)?.id;
     between = (data.between ?? []).map((pair) => ({ first: id(pair.first), second: id(pair.second), distance_m: pair.distance_m })).filter((pair) => pair.first && pair.second);
@@ -334,7 +326,7 @@ function listen() {
   };
   $("#fine").addEventListener("click", () => steps(false));
   $("#coarse").addEventListener("click", () => steps(true));
-  $("#back").addEventListener("click", () => dials.setAll(box.filed));
+  $("#back").addEventListener("click", () => dials.setAll(state.filed));
   $("#fit").addEventListener("click", fit);
   $("#undo").addEventListener("click", () => {
     if (before) dials.setAll(before);
@@ -343,18 +335,14 @@ function listen() {
     $("#fit").focus();
   });
   $("#save").addEventListener("click", save);
-  $("#export").addEventListener("click", exportMarks);
+  $("#export").addEventListener("click", () => download(`${JSON.stringify(points(), null, 2)}\n`, "points.json", "application/json"));
   $("#import").addEventListener("click", () => $("#import-file").click());
   $("#import-file").addEventListener("change", (event) => {
     if (event.target.files[0]) importMarks(event.target.files[0]);
     event.target.value = "";
   });
   $("#clear").addEventListener("click", () => {
-    marks = [];
-    between = [];
-    chosen = null;
-    list.showBetween(between, marks);
-    showMarks();
+    replaceMarks([], []);
     marksMoved();
   });
   $("#add-between").addEventListener("click", () => {
@@ -363,37 +351,38 @@ function listen() {
   });
 }
 
+// Checkboxes for the kinds of lines shown and for the values to fit.
 function makeChoices() {
+  const choice = (checked, value, change, ...label) => {
+    const onchange = (event) => change(event.target.checked);
+    return el("label", { class: "check" }, el("input", { type: "checkbox", checked, value, onchange }), ...label);
+  };
   for (const [kind, { label, colour }] of Object.entries(KINDS)) {
     const swatch = el("span", { class: "swatch", "aria-hidden": "true" });
     swatch.style.background = colour;
-    const check = el("input", { type: "checkbox", checked: true });
-    check.addEventListener("change", () => {
-      view.hidden[check.checked ? "delete" : "add"](kind);
+    $("#kinds").append(choice(true, kind, (shown) => {
+      view.hidden[shown ? "delete" : "add"](kind);
       view.repaint();
-    });
-    $("#kinds").append(el("label", { class: "check" }, check, swatch, label));
+    }, swatch, label));
   }
-  for (const key of Object.keys(NAMES)) {
-    const check = el("input", { type: "checkbox", checked: free.has(key), value: key });
-    check.addEventListener("change", () => {
-      free[check.checked ? "add" : "delete"](key);
+  for (const [key, [name]] of Object.entries(NAMES)) {
+    $("#free").append(choice(free.has(key), key, (on) => {
+      free[on ? "add" : "delete"](key);
       showWants();
-    });
-    $("#free").append(el("label", { class: "check" }, check, NAMES[key][0]));
+    }, name));
   }
 }
 
 async function open() {
   try {
-    box = await request("/align/state");
+    state = await request("/align/state");
   } catch (error) {
-    trouble(error.message);
+    showTrouble(error.message);
     return;
   }
-  dials.make(box.fields, box.start);
+  dials.make(state.fields, state.start);
   makeChoices();
-  $("#renew").hidden = !box.live;
+  $("#renew").hidden = !state.live;
   showFile();
   showChanges();
   listen();

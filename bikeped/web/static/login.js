@@ -1,5 +1,5 @@
-// The form leads back to where the visitor wanted to go; who has a session already goes there at
-// once (a browser withholds the cookie from a link on another site, but not from our own page).
+// The form returns to the page that was requested. With a session it opens at once: the browser
+// withholds the cookie from a link on another site, not from this page.
 const next = location.pathname === "/login" ? "/" : location.pathname;
 document.getElementById("next").value = next;
 document.getElementById("token").focus();

@@ -1,4 +1,4 @@
-// What every page uses: elements, requests, messages, formats, states, canvases, the theme.
+// Shared by all pages: elements, requests, messages, formats, states, canvases, the theme.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -23,7 +23,7 @@ function fill(node, attributes, children) {
   return node;
 }
 
-// Sets an element's text only when it differs: screen readers and selections are left alone.
+// Sets an element's text only when it differs, which keeps selections and screen readers undisturbed.
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
@@ -51,7 +51,7 @@ export async function request(path, { json, method, signal } = {}) {
     answer = await fetch(path, options);
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new RequestError("The box does not answer.", 0);
+    throw new RequestError("The server does not answer.", 0);
   }
   if (answer.status === 401) {
     location.reload();
@@ -65,7 +65,7 @@ export async function request(path, { json, method, signal } = {}) {
 
 // --- messages
 
-// Says a line to screen readers, politely.
+// Announces a line to screen readers.
 export function announce(text) {
   const place = $("#announcer");
   place.textContent = "";
@@ -81,7 +81,7 @@ export function toast(text, kind = "") {
   setTimeout(() => node.remove(), kind === "bad" ? 9000 : 4000);
 }
 
-// Saves a text as a file of the visitor's.
+// Downloads a text as a file.
 export function download(text, name, type) {
   const link = el("a", { href: URL.createObjectURL(new Blob([text], { type })), download: name });
   link.click();
@@ -130,10 +130,10 @@ export function stateIcon(name) {
 // The value of a custom property, e.g. colour("--ink").
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-const themed = new Set(); // what is drawn anew when the colours change
+const themed = new Set(); // functions that redraw when the colours change
 
-// Keeps a canvas as sharp as the screen: `draw(context, width, height)` in CSS pixels, called at every
-// change of size or theme. Returns the function that draws anew.
+// Matches a canvas to the screen's resolution: calls `draw(context, width, height)`, in CSS pixels, at
+// every change of size or theme. Returns the function that redraws.
 export function canvasOf(canvas, draw) {
   let width = 0, height = 0;
   const paint = () => {
@@ -163,7 +163,7 @@ const THEMES = [["", "◐", "as the device"], ["light", "○", "light"], ["dark"
 
 function setUpTheme() {
   const button = $("#theme");
-  const retell = () => themed.forEach((redraw) => redraw());
+  const redrawAll = () => themed.forEach((redraw) => redraw());
   const show = () => {
     const [, mark, word] = THEMES.find(([name]) => name === (document.documentElement.dataset.theme ?? ""));
     setText($("#theme-mark"), mark);
@@ -175,12 +175,12 @@ function setUpTheme() {
     const [name, , word] = THEMES[(now + 1) % THEMES.length];
     if (name) document.documentElement.dataset.theme = name;
     else delete document.documentElement.dataset.theme;
-    try { localStorage.setItem("theme", name); } catch { /* not remembered, then */ }
+    try { localStorage.setItem("theme", name); } catch { /* storage is off */ }
     show();
     announce(`Colours: ${word}`);
-    retell();
+    redrawAll();
   });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", retell);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawAll);
   show();
 }
 

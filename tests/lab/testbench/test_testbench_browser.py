@@ -136,14 +136,14 @@ def test_of_many_quick_changes_the_last_one_holds(testbench, until):
     until(page, "location.hash.includes('decision.d_max_m=20')")
 
 
-def test_every_knob_gives_an_answer(testbench):
+def test_every_control_gives_an_answer(testbench):
     page = testbench("scenario=Cyclist%20Abort&perception.trials=2")
     page.locator(".kn-group").evaluate_all("all => all.forEach(d => { d.open = true })")
-    page.get_by_label("who is seen", exact=True).select_option("0")
-    page.get_by_label("who is seen", exact=True).select_option(label="a share, set below")
+    page.get_by_label("detection", exact=True).select_option("0")
+    page.get_by_label("detection", exact=True).select_option(label="a fixed share")
     page.get_by_label("a second camera", exact=True).check()
-    for knob in page.locator('.kn:not([hidden]) input[type="checkbox"]').all():
-        knob.click()
+    for control in page.locator('.kn:not([hidden]) input[type="checkbox"]').all():
+        control.click()
     settled(page)
     for slider in page.locator('.kn:not([hidden]) input[type="range"]:not([disabled])').all():
         slider.press("PageUp")
@@ -293,7 +293,7 @@ def test_the_report_opens_from_the_disk(open_page, assert_accessible, tmp_path):
     expect(page.locator("#risks")).to_contain_text("Low light or rain")
     expect(page.locator("#strips canvas")).to_have_count(4)
     page.select_option("#scenario", "Bikes Only")
-    expect(page.locator("#headline")).to_have_text("The light is blue: nobody on foot is in sight.")
+    expect(page.locator("#headline")).to_have_text("The light is blue: no pedestrian is in view.")
     page.locator("#others").check()
     expect(page.locator("#figures tbody tr")).to_have_count(len(CONFIGURATIONS))
     page.locator("#strips button").nth(3).click()

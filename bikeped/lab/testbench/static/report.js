@@ -1,4 +1,4 @@
-// The report's playback: the same pictures as the test bench, from the data in the page.
+// The report's playback: the test bench's views, from the data in the page.
 
 import { $, canvasOf, el, percent, seconds } from "/static/ui.js";
 import { flow } from "/static/testbench-flow.js";
@@ -41,7 +41,7 @@ $("#strips").replaceChildren(
     const canvas = el("canvas", { role: "img", "aria-label": stripWords(strip) });
     canvasOf(canvas, (context, width, height) => drawStrip(context, width, height, strip, false));
     const { metrics } = data.plays[i].sides[0];
-    const told = metrics.sensitivity === null ? "no danger in which a warning helps" : `${percent(metrics.sensitivity, 0)} of the danger warned of, least budget ${seconds(metrics.min_warning_budget_s, 2)}`;
-    return el("li", {}, el("button", { type: "button", class: "su-open", onclick: () => { load(i); $("#watch").scrollIntoView(); } }, strip.name), canvas, el("p", { class: "note" }, told));
+    const summary = metrics.sensitivity === null ? "no danger in which a warning helps" : `${percent(metrics.sensitivity, 0)} of the danger warned of, shortest budget ${seconds(metrics.min_warning_budget_s, 2)}`;
+    return el("li", {}, el("button", { type: "button", class: "su-open", onclick: () => { load(i); $("#watch").scrollIntoView(); } }, strip.name), canvas, el("p", { class: "note" }, summary));
   })));
 load(Math.max(0, data.plays.findIndex((play) => play.scenario.name === "Bike Approaches Ped")));

@@ -1,11 +1,11 @@
-// The knobs: every setting of a bench with its slider and its number. Ranges and meanings come from
+// The settings of the bench, each with a slider and a number field. Ranges and descriptions come from
 // the Python types that check them.
 
 import { el, setText } from "/static/ui.js";
 
 const CHOICES = {
   "decision.rule": [["pairwise", "pairwise (the paper’s)"], ["naive", "naive closing"], ["ttc", "time to collision"], ["distance", "distance only"]],
-  "perception.recall": [["all", "everybody is seen"], ["size", "measured, by size"], ["kind", "measured, by kind"], ["fixed", "a share, set below"]],
+  "perception.recall": [["all", "all are detected"], ["size", "measured, by size"], ["kind", "measured, by kind"], ["fixed", "a fixed share"]],
   "delay.order": [[0, "none"], [1, "by velocity"], [2, "and acceleration"]],
   "danger.braking": [[null, "by the scenario"], ["bicycle", "bicycle"], ["ebike", "e-bike"], ["aashto", "AASHTO"]],
 };
@@ -17,22 +17,22 @@ const GROUPS = [
     ["decision.memory_frames", "memory N", "frames", 0, 120, 1],
     ["decision.d_min_m", "nearest d_min", "m", 0.5, 5, 0.1],
     ["decision.d_max_m", "farthest d_max", "m", 5, 25, 0.1],
-    ["decision.min_displacement_m", "least way δ_min", "m", 0, 0.5, 0.001],
+    ["decision.min_displacement_m", "shortest displacement δ_min", "m", 0, 0.5, 0.001],
     ["decision.lookback_frames", "lookback k", "frames", 1, 10, 1],
     ["decision.speed_adaptive", "d_max grows with speed", "switch"],
-    ["decision.ttc_s", "soon (rule time to collision)", "s", 0.5, 8, 0.1],
+    ["decision.ttc_s", "bound (rule time to collision)", "s", 0.5, 8, 0.1],
   ]],
-  ["What the camera makes of it", false, [
-    ["perception.localisation_error", "misplaces people", "switch"],
-    ["perception.recall", "who is seen", "choice"],
-    ["perception.recall_value", "share seen", "", 0.3, 1, 0.01],
+  ["Perception", false, [
+    ["perception.localisation_error", "position error", "switch"],
+    ["perception.recall", "detection", "choice"],
+    ["perception.recall_value", "share detected", "", 0.3, 1, 0.01],
     ["perception.burst_frames", "misses in runs of", "frames", 1, 30, 1, 5],
     ["perception.trial", "random trial", "", 0, 49, 1],
     ["perception.seed", "seed", "number"],
     ["perception.trials", "trials for means", "", 1, 50, 1],
   ]],
   ["Delay", false, [
-    ["delay.delay_ms", "picture’s age", "ms", 0, 500, 33],
+    ["delay.delay_ms", "age of the picture", "ms", 0, 500, 33],
     ["delay.order", "prediction", "choice"],
   ]],
   ["The camera’s mount", false, [
@@ -41,15 +41,15 @@ const GROUPS = [
     ["camera.fov_deg", "field of view", "°", 60, 220, 0.1],
     ["camera.x_m", "east", "m", -20, 30, 0.5],
     ["camera.y_m", "north", "m", -30, 30, 0.5],
-    ["camera.heading_deg", "looks to", "°", -180, 360, 5],
+    ["camera.heading_deg", "heading", "°", -180, 360, 5],
     ["second_camera", "a second camera", "second"],
     ["second_camera.x_m", "second: east", "m", -20, 30, 0.5],
     ["second_camera.y_m", "second: north", "m", -30, 30, 0.5],
-    ["second_camera.heading_deg", "second: looks to", "°", -180, 360, 5],
+    ["second_camera.heading_deg", "second: heading", "°", -180, 360, 5],
   ]],
   ["What counts as danger", false, [
-    ["danger.cpa_radius_m", "will come nearer than", "m", 0.5, 15, 0.1],
-    ["danger.stopping_margin", "stopping over gap ×", "", 0.1, 2, 0.05],
+    ["danger.cpa_radius_m", "closest approach below", "m", 0.5, 15, 0.1],
+    ["danger.stopping_margin", "stopping distance over gap", "", 0.1, 2, 0.05],
     ["danger.ttc_bound_s", "contact within", "s", 0.5, 10, 0.1, 3],
     ["danger.braking", "all cyclists brake as", "choice"],
   ]],
@@ -65,7 +65,7 @@ export function set(bench, key, value) {
   return name ? { ...bench, [section]: { ...bench[section], [name]: value } } : { ...bench, [section]: value };
 }
 
-// Builds the knobs in `host`; `change(key, value)` at every move. Returns show(bench, base).
+// Builds the controls in `host`; `change(key, value)` at every change. Returns show(bench, base).
 export function controls(host, about, change) {
   const shown = [];
   for (const [title, open, settings] of GROUPS) {
@@ -73,16 +73,16 @@ export function controls(host, about, change) {
     const body = el("div", { class: "kn-body" });
     const group = el("details", { class: "kn-group", open }, el("summary", {}, el("span", {}, title), mark), body);
     const own = settings.map((setting) => {
-      const knob = make(setting, about, change);
-      body.append(knob.node);
-      return knob;
+      const control = make(setting, about, change);
+      body.append(control.node);
+      return control;
     });
     shown.push({ mark, own });
     host.append(group);
   }
   return (bench, base) => {
     for (const { mark, own } of shown) {
-      const changed = own.filter((knob) => knob.show(bench, base)).length;
+      const changed = own.filter((control) => control.show(bench, base)).length;
       setText(mark, changed ? `${changed} changed` : "");
     }
   };

@@ -1,4 +1,4 @@
-// Drawing scenarios: waypoints on the plan, and the same as a table for the keyboard.
+// Editing scenarios: waypoints on the plan, and the same as a table for the keyboard.
 
 import { announce, el, setText } from "/static/ui.js";
 
@@ -15,7 +15,7 @@ export function editor(host, change, actions) {
   let script = null, chosen = [0, 0], built = "", keepSpeed = true, nameField = null;
   const rows = [];
 
-  // The page may give the changed scenario a name of its own.
+  // The page may rename the changed scenario.
   const emit = () => { script.name = change(structuredClone(script)); };
   const handles = () => (script?.agents ?? []).flatMap((agent, a) => agent.path.map(([t, x, y], i) => (
     { a, i, t, x, y, role: ROLE[agent.kind] ?? "vehicle", chosen: chosen[0] === a && chosen[1] === i })));
@@ -73,7 +73,7 @@ export function editor(host, change, actions) {
     const file = el("input", { type: "file", class: "unseen", accept: ".yaml,.yml,text/yaml", id: "ed-open" });
     file.addEventListener("change", () => { if (file.files[0]) actions.load(file.files[0]); file.value = ""; });
     host.replaceChildren(
-      el("p", { class: "note" }, "Drag the squares in the plan; a double click adds a waypoint to the road user last touched. Or write the numbers: t in seconds, x east and y north in metres; the speed is that of the way to this waypoint."),
+      el("p", { class: "note" }, "Drag the squares in the plan; a double click adds a waypoint to the road user last touched. Or write the numbers: t in seconds, x east and y north in metres; the speed is that on the way to this waypoint."),
       el("div", { class: "ed-top" },
         el("label", { class: "tb-pick ed-name" }, el("span", {}, "Name"), name),
         pick("Hazard", HAZARDS, "hazard"), pick("Vehicle", ["bicycle", "ebike"], "vehicle"), pick("Expected", ["idle", "safe", "warning", "alert"], "expected"),

@@ -1,4 +1,4 @@
-// The pipeline as a diagram: what each stage has at this moment, and which tests pass.
+// The pipeline as a diagram: the output of each stage in the frame shown, and which checks pass.
 
 import { el, metres, seconds, setText, stateIcon, STATES } from "/static/ui.js";
 import { chosenPair, stateAt, tracksAt } from "/static/testbench-words.js";
@@ -13,9 +13,9 @@ export function flow(host) {
   const tracker = stage(stages, "Tracker");
   const prediction = stage(stages, "Prediction");
   const decide = el("ol", { class: "fl-questions" });
-  const walker = question(decide, "Anybody on foot?", "IDLE", "no");
-  const memory = question(decide, "A cyclist lately?", "SAFE", "no");
-  const closing = question(decide, "Are they closing in?", "WARNING", "no");
+  const pedestrian = question(decide, "Pedestrian present?", "IDLE", "no");
+  const memory = question(decide, "Cyclist seen recently?", "SAFE", "no");
+  const closing = question(decide, "Closing in?", "WARNING", "no");
   const end = el("li", { class: "fl-end" });
   const out = exit("ALERT", "yes");
   end.append(out);
@@ -35,13 +35,13 @@ export function flow(host) {
     perception.show(`${found.length} of ${here.length} seen${missed.length ? `, ${COUNT(missed.length, "miss", "misses")}` : ""}${late}`, missed.length > 0);
     const errors = found.map((agent) => agent.error_m[frame]).filter((value) => value !== null);
     const [least, most] = [Math.min(...errors), Math.max(...errors)].map((e) => e.toFixed(2));
-    place.show(!errors.length ? "nobody to place" : least === most ? `places off by ${most} m` : `places off by ${least} to ${most} m`);
+    place.show(!errors.length ? "no positions" : least === most ? `error ${most} m` : `error ${least} to ${most} m`);
     const coasting = tracks.length - found.length;
-    tracker.show(tracks.length ? `${COUNT(tracks.length, "track", "tracks")}${coasting > 0 ? `, ${coasting} unseen and carried on` : ""}` : "no tracks", coasting > 0);
+    tracker.show(tracks.length ? `${COUNT(tracks.length, "track", "tracks")}${coasting > 0 ? `, ${coasting} predicted without detection` : ""}` : "no tracks", coasting > 0);
     prediction.show(play.order && play.delay_frames ? `${play.delay_frames} frames ahead by ${play.order === 1 ? "velocity" : "velocity and acceleration"}` : "none");
 
     const people = side.pedestrians[frame];
-    walker.show(people > 0, people ? `yes, ${people}` : "no", state === "IDLE", true);
+    pedestrian.show(people > 0, people ? `yes, ${people}` : "no", state === "IDLE", true);
     const since = side.since_cyclist_s[frame];
     const window = side.memory_s > 0 ? `within ${seconds(side.memory_s, 2)}` : "now";
     memory.show(side.remembered[frame], since === null ? `never (asked: ${window})` : `${since === 0 ? "now" : `${seconds(since, 2)} ago`} (asked: ${window})`, state === "SAFE", people > 0);
@@ -95,8 +95,8 @@ function light(chip, lit) {
   setText(chip.querySelector(".fl-now"), lit ? " (now)" : "");
 }
 
-// Each test: its words, its figures, a small scale, and whether it passes. Figures and passes are the
-// rule's; `judged` false means that the later ones were not asked.
+// The checks of the rule: texts, values and a scale. Values and results are the rule's own; without
+// `judged` the later checks were not evaluated.
 function testsOf(decision, side, pair) {
   const frames = decision.lookback_frames;
   const reach = Math.max(30, decision.d_max_m);
@@ -107,17 +107,17 @@ function testsOf(decision, side, pair) {
   ];
   const judged = pair?.passes.judged;
   const gone = judged ? pair.then - pair.distance : null;
-  const told = judged ? `${plain(pair.distance)} < ${metres(pair.then, 2)}` : `than ${frames} frames ago`;
+  const approach = judged ? `${plain(pair.distance)} < ${metres(pair.then, 2)}` : `than ${frames} frames ago`;
   if (decision.rule === "distance") return list;
   if (decision.rule === "ttc") {
     const speed = judged ? gone / pair.lookback : null;
     return [...list,
-      { key: "closing", late: true, text: "closing", shows: judged ? `${speed.toFixed(2)} > 0.10 m/s` : told, scale: [speed, 0.1, null, 12] },
+      { key: "closing", late: true, text: "closing", shows: judged ? `${speed.toFixed(2)} > 0.10 m/s` : approach, scale: [speed, 0.1, null, 12] },
       { key: "enough", late: true, text: "soon together", shows: judged && speed > 0 ? `in ${seconds(pair.distance / speed, 1)} < ${seconds(decision.ttc_s, 1)}` : `< ${seconds(decision.ttc_s, 1)}`, scale: [judged && speed > 0 ? pair.distance / speed : null, null, decision.ttc_s, 8] },
     ];
   }
   return [...list,
-    { key: "closing", late: true, text: `nearer than ${judged ? `${seconds(pair.lookback, 2)} ago` : "before"}${decision.rule === "naive" ? ", cyclist only" : ""}`, shows: told, scale: [gone, 0, null, 1, -1] },
+    { key: "closing", late: true, text: `nearer than ${judged ? `${seconds(pair.lookback, 2)} ago` : "before"}${decision.rule === "naive" ? ", cyclist only" : ""}`, shows: approach, scale: [gone, 0, null, 1, -1] },
     { key: "enough", late: true, text: "the cyclist moved", shows: judged ? `${pair.moved.toFixed(3)} > ${metres(decision.min_displacement_m, 3)}` : `> ${metres(decision.min_displacement_m, 3)}`, scale: [judged ? pair.moved : null, decision.min_displacement_m, null, 1.2] },
   ];
 }

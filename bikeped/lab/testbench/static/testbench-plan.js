@@ -236,5 +236,5 @@ export function planWords(play, frame) {
   const side = play.sides[0];
   const words = play.agents.filter((agent) => agent.true[2 * frame] !== null).map((agent) =>
     `${agent.kind} ${agent.id} at ${agent.true[2 * frame].toFixed(1)} east, ${agent.true[2 * frame + 1].toFixed(1)} north`);
-  return `Plan view, ${NAMES[side.state[frame]]}. ${words.join("; ") || "nobody is there"}.`;
+  return `Plan view, ${NAMES[side.state[frame]]}. ${words.join("; ") || "no road users"}.`;
 }

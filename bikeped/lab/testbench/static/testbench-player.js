@@ -1,12 +1,12 @@
-// A playback on the page: the moment, its sentence, the pictures, the keys. The report uses it too.
+// The playback of a scenario: the frame shown, its sentence, the views, the keys. The report has it too.
 
 import { $, el, percent, seconds, setText, stateIcon, STATES } from "/static/ui.js";
 import { planWords } from "/static/testbench-plan.js";
 import { spans, timeline } from "/static/testbench-timeline.js";
 import { NAMES, TIERS, chosenPair, configurationName, headline, judgement, spoken, stateAt } from "/static/testbench-words.js";
 
-const LEGEND = [["pedestrian", "pedestrian"], ["cyclist", "cyclist"], ["vehicle", "vehicle"], ["ring", "where the camera puts them"], ["pair", "the pair that decides"], ["seen", "ground the camera sees"]];
-const TIME_LEGEND = [["actionable", "danger, a warning helps"], ["imminent", "danger, too late to react"], ["true", "true distance"], ["measured", "distance the rule saw"], ["band", "distances that can alert"], ["onset", "alert begins"], ["closest", "closest approach"]];
+const LEGEND = [["pedestrian", "pedestrian"], ["cyclist", "cyclist"], ["vehicle", "vehicle"], ["ring", "detected position"], ["pair", "the pair that decides"], ["seen", "ground the camera sees"]];
+const TIME_LEGEND = [["actionable", "danger, a warning helps"], ["imminent", "danger, too late to react"], ["true", "true distance"], ["measured", "measured distance"], ["band", "distances that can alert"], ["onset", "alert begins"], ["closest", "closest approach"]];
 
 // `options` = {diagram, plan(canvas, where), handles(), editing()}; elements by their ids.
 export function player(options) {
@@ -35,11 +35,11 @@ export function player(options) {
     }
     setText($("#headline"), headline(play, side, frame));
     setText($("#sentence"), side.sentence[frame]);
-    const told = judgement(play, side, frame);
-    $("#verdict").dataset.good = told.neutral ? "late" : String(told.good);
+    const verdict = judgement(play, side, frame);
+    $("#verdict").dataset.good = verdict.neutral ? "late" : String(verdict.good);
     const [word, why] = ensure($("#verdict"));
-    setText(word, told.word);
-    setText(why, told.why);
+    setText(word, verdict.word);
+    setText(why, verdict.why);
     setText($("#clock"), `${(frame / play.fps).toFixed(2)} s, frame ${frame}`);
     options.diagram(play, side, frame);
     picture.paint();
@@ -112,13 +112,13 @@ export function player(options) {
       $("#to-closest").disabled = play.closest_s === null;
       figures($("#figures"), play);
       changesTable($("#table"), play);
-      setText($("#table-note"), `${play.scenario.name}: every moment at which a state or the danger changes.`);
+      setText($("#table-note"), `${play.scenario.name}: every change of a state or of the danger.`);
       paint();
     },
   };
 }
 
-// The moment to begin with: somewhat into the first alert, where the why is clearest.
+// The first frame shown: half a second into the first alert.
 function opening(play) {
   const [onset] = play.sides[0].onsets;
   return onset ? Math.min(onset.frame + 15, play.frames - 1) : Math.round(play.frames / 2);
@@ -133,7 +133,7 @@ function figures(host, play) {
     ["Sensitivity", (s) => `${percent(s.metrics.sensitivity)} (${s.counts.actionable_alert} of ${s.counts.actionable} frames)`],
     ["Specificity", (s) => `${percent(s.metrics.specificity)} (${s.counts.calm - s.counts.calm_alert} of ${s.counts.calm})`],
     ["Missed severity", (s) => percent(s.metrics.sev_fn)],
-    ["Least budget", (s) => seconds(s.metrics.min_warning_budget_s, 2)],
+    ["Shortest budget", (s) => seconds(s.metrics.min_warning_budget_s, 2)],
     ["First alert before closest approach", (s) => seconds(s.metrics.first_onset_lead_s, 2)],
     ["Time red", (s) => percent(s.metrics.fatigue)],
   ];
@@ -145,13 +145,13 @@ function figures(host, play) {
     el("tbody", {}, play.sides.map((side) => el("tr", {}, el("th", { scope: "row" }, configurationName(side.name)), rows.map(([, say]) => el("td", { class: "number" }, say(side)))))));
 }
 
-// The pictures in words: one row wherever something changes.
+// The playback as a table: one row for every change.
 function changesTable(host, play) {
   const marks = new Set([0]);
   for (const codes of [play.truth.tier, ...play.sides.map((side) => side.state)]) for (const { from } of spans(codes)) marks.add(from);
   const frames = [...marks].sort((a, b) => a - b);
   host.replaceChildren(
-    el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Time"), play.sides.map((side) => el("th", { scope: "col" }, configurationName(side.name))), el("th", { scope: "col" }, "Danger (truth)"), el("th", { scope: "col", class: "number" }, "Pair, m"), el("th", { scope: "col" }, "The rule’s words"))),
+    el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Time"), play.sides.map((side) => el("th", { scope: "col" }, configurationName(side.name))), el("th", { scope: "col" }, "Danger (truth)"), el("th", { scope: "col", class: "number" }, "Pair, m"), el("th", { scope: "col" }, "Sentence of the rule"))),
     el("tbody", {}, frames.map((f) => {
       const pair = chosenPair(play, play.sides[0], f);
       return el("tr", {}, el("th", { scope: "row" }, `${(f / play.fps).toFixed(2)} s`), play.sides.map((side) => el("td", {}, STATES[NAMES[side.state[f]]])), el("td", {}, { none: "–", actionable: "yes, a warning helps", imminent: "yes, too late" }[TIERS[play.truth.tier[f]]]), el("td", { class: "number" }, pair ? pair.distance.toFixed(2) : "–"), el("td", {}, play.sides[0].sentence[f]));

@@ -1,4 +1,4 @@
-// The whole suite, before and after: gates, figures, every scenario as a strip, and how to repeat it.
+// The whole suite, before and after: gates, figures, a strip for every scenario, and how to repeat it.
 
 import { canvasOf, el, fixed, percent, seconds } from "/static/ui.js";
 import { drawStrip, stripWords } from "/static/testbench-strip.js";
@@ -56,25 +56,25 @@ function figures(data, changed, trials) {
       const worse = difference !== null && Math.abs(difference) > 5e-4 && Math.sign(difference) !== better;
       const unit = say === percent ? `${(100 * difference).toFixed(1)}\u00a0pp` : difference?.toFixed(2);
       const small = difference === null || Math.abs(difference) < 5e-4;
-      const told = trials?.[key];
+      const mean = trials?.[key];
       return el("tr", {}, el("th", { scope: "row" }, name),
         changed ? el("td", { class: "number" }, cell(data.before, key, say)) : null,
         el("td", { class: "number" }, cell(data.after, key, say)),
         changed ? el("td", { class: `number ${small ? "" : worse ? "bad-mark" : "ok-mark"}` }, small ? "–" : `${difference > 0 ? "+" : "−"}${unit.replace("-", "")}`) : null,
-        trials ? el("td", { class: "number" }, told.mean === null ? "–" : told.low === null ? say(told.mean) : `${say(told.mean)} (${say(told.low)} to ${say(told.high)})`) : null);
+        trials ? el("td", { class: "number" }, mean.mean === null ? "–" : mean.low === null ? say(mean.mean) : `${say(mean.mean)} (${say(mean.low)} to ${say(mean.high)})`) : null);
     }))));
 }
 
 function repeat(data, changed, actions) {
   const list = data.changes.map(({ key, before, after }) => el("li", {}, el("code", {}, key.replace("danger.", "truth.")), ` ${word(before)} → `, el("b", {}, word(after))));
   return el("div", { class: "su-repeat" },
-    el("h3", {}, changed ? "Your challenge" : "Nothing is contested yet"),
-    changed ? el("ul", { class: "su-changes" }, list) : el("p", { class: "note" }, "Move a slider, or draw a path: the suite runs again, and here is what it changes."),
+    el("h3", {}, changed ? "Your changes" : "Nothing is changed yet"),
+    changed ? el("ul", { class: "su-changes" }, list) : el("p", { class: "note" }, "Move a slider or edit a path: the suite runs again, and the changes are listed here."),
     changed ? el("div", { class: "row" },
       el("button", { type: "button", class: "small primary", onclick: actions.save }, "Save as a file"),
       el("button", { type: "button", class: "small", onclick: actions.link }, "Copy link")) : null,
-    el("label", { class: "button small" }, "Open a challenge", el("input", { type: "file", class: "unseen", id: "open-challenge", accept: ".json,application/json", onchange: actions.load })),
-    changed ? el("div", {}, el("p", { class: "note" }, "The very same numbers on any computer:"),
+    el("label", { class: "button small" }, "Open a file", el("input", { type: "file", class: "unseen", id: "open-challenge", accept: ".json,application/json", onchange: actions.load })),
+    changed ? el("div", {}, el("p", { class: "note" }, "Commands that compute the same numbers:"),
       el("pre", { tabindex: 0, "aria-label": "Command line" }, `${data.again}${data.command ? `\n${data.command}` : ""}`)) : null);
 }
 
@@ -106,6 +106,6 @@ function strips(data, changed, actions) {
   const order = changed ? [...rows].sort((a, b) => b.classList.contains("differs") - a.classList.contains("differs")) : rows;
   return el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Every scenario" }, el("table", { class: "su-table" },
     el("caption", {}, changed ? `${different.size} of ${data.strips.length} scenarios change. Each strip: danger above, states below, before (pale) over after.` : "Each strip: danger above, states below; the higher, the more urgent."),
-    el("thead", {}, el("tr", {}, ["Scenario", "Over time", "Sensitivity", "Specificity", "Least budget"].map((text, i) => el("th", { scope: "col", class: i > 1 ? "number" : "" }, text)))),
+    el("thead", {}, el("tr", {}, ["Scenario", "Over time", "Sensitivity", "Specificity", "Shortest budget"].map((text, i) => el("th", { scope: "col", class: i > 1 ? "number" : "" }, text)))),
     el("tbody", {}, order)));
 }

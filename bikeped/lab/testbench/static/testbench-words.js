@@ -1,5 +1,5 @@
-// What the pages say in words, and how they read a playback. No rule lives here: every number and
-// every passed test comes from the deployed Python code.
+// Texts of the pages, and access to a playback's data. All numbers and results of checks come from the
+// deployed Python code.
 
 import { metres, seconds } from "/static/ui.js";
 
@@ -10,7 +10,7 @@ export const TIERS = ["none", "actionable", "imminent"];
 // Names of configurations as people read them.
 export function configurationName(name, short = false) {
   const words = {
-    bench: ["your numbers", "The bench’s numbers"], configured: ["in force", "In force on this box"],
+    bench: ["your settings", "Your settings"], configured: ["in force", "In force"],
     selected: ["selected", "Selected (paper)"], conservative: ["conservative", "Conservative"],
     narrow: ["narrow", "Narrow"], speed_adaptive: ["speed-adaptive", "Speed-adaptive"],
     distance_only: ["distance only", "Distance only"], naive_closing: ["naive closing", "Naive closing"],
@@ -51,16 +51,16 @@ export function tracksAt(play, frame) {
   return found;
 }
 
-// Why the light shows what it shows, for somebody who has never heard of the rule.
+// Why the light shows its colour, without terms of the rule.
 export function headline(play, side, frame) {
   const state = stateAt(side, frame);
-  const people = side.pedestrians[frame] === 1 ? "Somebody is" : `${side.pedestrians[frame]} people are`;
+  const people = side.pedestrians[frame] === 1 ? "a pedestrian is" : `${side.pedestrians[frame]} pedestrians are`;
   const start = `The light is ${LIGHT[state]}: `;
-  if (state === "IDLE") return `${start}nobody on foot is in sight.`;
+  if (state === "IDLE") return `${start}no pedestrian is in view.`;
   const since = side.since_cyclist_s[frame];
-  if (state === "SAFE") return `${start}${people.toLowerCase()} on foot, and no cyclist has been here for ${since === null ? "a while" : seconds(since)}.`;
+  if (state === "SAFE") return `${start}${people} in view, and no cyclist has been seen for ${since === null ? "a while" : seconds(since)}.`;
   const pair = chosenPair(play, side, frame);
-  if (!pair) return `${start}${people.toLowerCase()} on foot, and a cyclist was here ${seconds(since)} ago.`;
+  if (!pair) return `${start}${people} in view, and a cyclist was seen ${seconds(since)} ago.`;
   const apart = metres(pair.distance);
   const rule = side.decision.rule;
   if (state === "ALERT") {
@@ -68,12 +68,12 @@ export function headline(play, side, frame) {
     if (rule === "ttc") return `${start}a cyclist and a pedestrian, ${apart} apart, would meet within ${seconds(side.decision.ttc_s, 0)}.`;
     return `${start}a cyclist and a pedestrian are ${apart} apart and getting closer.`;
   }
-  return `${start}a cyclist and a pedestrian are here, ${apart} apart, but ${whyNot(side, pair)}.`;
+  return `${start}a cyclist and a pedestrian are in view, ${apart} apart, but ${whyNot(side, pair)}.`;
 }
 
 function whyNot(side, pair) {
   const { passes } = pair;
-  if (!passes.far_enough) return "too near for a warning still to help";
+  if (!passes.far_enough) return "too near for a warning to help";
   if (!passes.near_enough) return "too far apart to matter yet";
   if (!passes.in_range) return "too far from the camera to be judged";
   if (!passes.judged) return "one of them has only just appeared";
@@ -82,7 +82,7 @@ function whyNot(side, pair) {
   return "the cyclist hardly moves";
 }
 
-// Was it right? The truth of the frame beside the state.
+// Whether the state is right by the ground truth of the frame.
 export function judgement(play, side, frame) {
   const tier = TIERS[play.truth.tier[frame]];
   const alert = stateAt(side, frame) === "ALERT";
@@ -95,8 +95,8 @@ export function judgement(play, side, frame) {
   }
   if (tier === "imminent") return { good: alert, word: alert ? "Warned, but late" : "Too late to warn", why: `Danger: ${contact}, sooner than a distracted person can react.`, neutral: true };
   return alert
-    ? { good: false, word: "Alert without danger", why: "By the ground truth nobody is in danger now." }
-    : { good: true, word: "Rightly quiet", why: "By the ground truth nobody is in danger now." };
+    ? { good: false, word: "Alert without danger", why: "By the ground truth there is no danger now." }
+    : { good: true, word: "Correctly no alert", why: "By the ground truth there is no danger now." };
 }
 
 // The time in words, for screen readers.

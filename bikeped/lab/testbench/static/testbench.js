@@ -1,4 +1,4 @@
-// The test bench: asks the box for runs of the deployed rule and shows them. It computes no verdict.
+// The test bench: requests runs of the deployed rule and shows them. It evaluates no rule itself.
 
 import { $, announce, download, el, request, setText, toast } from "/static/ui.js";
 import { controls, set } from "/static/testbench-controls.js";
@@ -12,13 +12,13 @@ import { configurationName } from "/static/testbench-words.js";
 const CLIENT = crypto.randomUUID?.().slice(0, 36) ?? String(Math.random());
 const app = { about: null, bench: null, play: null, suite: null, own: new Map(), editing: false };
 const REST_MS = 80;
-let show, knobs, diagram, edits, suite, resting = 0, due = null;
+let show, showControls, diagram, edits, suite, resting = 0, due = null;
 
-// --- asking: one request of a kind on its way, of those that wait only the newest
+// --- requests: one of a kind at a time; of those that wait only the newest is sent
 
-function newest(kind, take, told) {
+function requestNewest(kind, take, status) {
   let busy = false, next = null;
-  const state = (word) => { $("#tb").dataset[kind] = word; if (told) setText(told, word === "busy" ? "computing …" : ""); };
+  const state = (word) => { $("#tb").dataset[kind] = word; if (status) setText(status, word === "busy" ? "computing …" : ""); };
   const send = async (job) => {
     busy = true;
     state("busy");
@@ -50,7 +50,7 @@ function failed(error) {
   else toast(error.message, "bad");
 }
 
-const askScenario = newest("scenario", (data, job) => {
+const askScenario = requestNewest("scenario", (data, job) => {
   app.play = data;
   edits.fail("");
   if (job.bench === app.bench) edits.show(data.script);
@@ -61,17 +61,17 @@ const askScenario = newest("scenario", (data, job) => {
   if (job.bench === app.bench) drawn();
 }, $("#busy"));
 
-const askSuite = newest("suite", (data, job) => {
+const askSuite = requestNewest("suite", (data, job) => {
   app.suite = data;
   suite(data, null);
-  setText($("#suite-title"), data.changes.length ? "Contest it: the whole suite, before and after" : "The whole suite");
+  setText($("#suite-title"), data.changes.length ? "The whole suite, before and after your changes" : "The whole suite");
   measured("bench:suite", job);
   const failing = data.after.gates.filter((gate) => !gate.holds).length;
   if (data.changes.length) announce(`Suite computed. ${failing ? `${failing} gates fail` : "All gates hold"}. ${data.changed.length} scenarios change.`);
   if (job.bench.perception.recall !== "all") askTrials(job.bench);
 }, $("#suite-busy"));
 
-const askTrials = newest("trials", (data, job) => {
+const askTrials = requestNewest("trials", (data, job) => {
   if (app.suite && job.bench === app.wanted) suite(app.suite, data.trials);
 });
 
@@ -91,11 +91,11 @@ function rememberLink(link) {
 
 function change(bench, { scenarioOnly = false } = {}) {
   app.bench = bench;
-  knobs(bench, app.about.base);
+  showControls(bench, app.about.base);
   showPicks();
   askScenario(bench);
   if (scenarioOnly) return;
-  // The suite follows when the scenario is drawn and the hand rests.
+  // The suite follows when the scenario is drawn and no further change came.
   app.wanted = bench;
   due = { bench, began: performance.now() };
   clearTimeout(resting);
@@ -118,7 +118,7 @@ function withOwn(bench) {
   return { ...bench, scripts: [...app.own.values()].map((script) => JSON.stringify(script)) };
 }
 
-// A path was changed: a bundled scenario becomes one of one's own, under a name of its own.
+// Takes an edited script; a changed bundled scenario gets a new name.
 function redraw(script) {
   const bundled = app.about.scenarios.some((s) => s.name === script.name);
   if (bundled && !app.own.has(script.name)) script.name = freeName(script.name);
@@ -194,8 +194,8 @@ async function take(text, name) {
   const { bench } = await request("/testbench/read-challenge", { json: { text, name } });
   app.own.clear();
   for (const script of bench.scripts) {
-    const told = await request("/testbench/read-scenario", { json: { text: script, name: "scenario" } });
-    app.own.set(told.script.name, told.script);
+    const answer = await request("/testbench/read-scenario", { json: { text: script, name: "scenario" } });
+    app.own.set(answer.script.name, answer.script);
   }
   return bench;
 }
@@ -207,7 +207,7 @@ async function loadChallenge(event) {
   try {
     const bench = await take(await file.text(), file.name.slice(0, 100));
     change(bench.scenario ? bench : { ...bench, scenario: app.bench.scenario });
-    announce("Challenge opened.");
+    announce("File opened.");
   } catch (error) { toast(error.message, "bad"); }
 }
 
@@ -236,7 +236,7 @@ async function start() {
     original: () => { app.own.delete(app.bench.scenario); edits.rebuild(); change(withOwn({ ...app.bench, scenario: app.about.scenarios[0].name })); },
   });
   show = player({ diagram, handles: () => (app.editing ? edits.handles() : null), editing: () => app.editing, plan: (canvas, where) => plan(canvas, where, edits.drag) });
-  knobs = controls($("#knobs"), app.about, (key, value) => change(set(app.bench, key, value), {}));
+  showControls = controls($("#controls"), app.about, (key, value) => change(set(app.bench, key, value), {}));
   suite = suitePanel($("#suite"), { open: (name) => { choose(name); scrollTo({ top: 0 }); }, save: () => download(app.suite.file, "challenge.json", "application/json"), link: copyLink, load: loadChallenge });
   $("#scenario").addEventListener("change", (event) => choose(event.target.value));
   $("#configuration").addEventListener("change", (event) => { const decision = app.about.configurations[event.target.value]; if (decision) change({ ...app.bench, decision }); });
@@ -251,16 +251,16 @@ async function start() {
   $("#edit").addEventListener("click", () => setEditing(!app.editing));
   const { about } = app;
   $("#provenance").replaceChildren(
-    "One rule: this page computes with the code that runs on the pole. Deciding code ", el("code", { title: about.rule_hash }, about.rule_hash.slice(0, 16)),
+    "This page runs the deployed code. Code of the rule ", el("code", { title: about.rule_hash }, about.rule_hash.slice(0, 16)),
     ", suite ", el("code", { title: about.suite_hash }, about.suite_hash.slice(0, 16)), ", configuration ", el("code", { title: about.config_hash }, about.config_hash.slice(0, 16)), `, bikeped ${about.version}.`);
   let bench = first;
   if (location.hash.length > 1) {
     try {
-      const told = await take(location.hash.slice(1), "link");
-      bench = told.scenario ? told : { ...told, scenario: first.scenario };
+      const linked = await take(location.hash.slice(1), "link");
+      bench = linked.scenario ? linked : { ...linked, scenario: first.scenario };
     } catch (error) { toast(error.message, "bad"); }
   }
   change(bench);
 }
 
-start().catch((error) => { setText($("#headline"), `The bench did not start: ${error.message}`); });
+start().catch((error) => { setText($("#headline"), `The test bench did not start: ${error.message}`); });
