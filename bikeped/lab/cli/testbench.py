@@ -99,7 +99,7 @@ def contest(
         bench = _read(file)
     work = BenchRunner(loaded, scenarios)
     comparison = compare_settings(work, bench).as_dict()
-    trials = trial_summaries(work.whole(bench), bench)
+    trials = trial_summaries(work.full_suite(bench), bench)
     words = origin.command_line("testbench", "contest", challenge)
     if json_path is not None:
         write_json({"command": words, **comparison, "trials": trials}, json_path)

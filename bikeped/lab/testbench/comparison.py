@@ -50,9 +50,9 @@ class InvocationOptions:
 def compare_settings(work: BenchRunner, bench: BenchSettings) -> Comparison:
     """The suite under the configuration in force and under `bench`."""
     base = settings_in_force(work.loaded)
-    before = work.whole(base)
+    before = work.full_suite(base)
     changed = msgspec.structs.replace(bench, decision=base.decision, scenario="", beside=())
-    after = before if changed == base else work.whole(bench)  # a decision needs no new run
+    after = before if changed == base else work.full_suite(bench)  # a decision needs no new run
     return compare_variants(before, base.decision, after, bench.decision)
 
 

@@ -1,8 +1,8 @@
-"""One self-contained page: every scenario's playback, figures, gates and residual risks.
+"""The HTML report in one file: playback of every scenario, figures, gates and residual risks.
 
-It needs no network and no server: style sheets, scripts and data are inside, and its own content
-security policy lets it load nothing else. The pictures are drawn by the very modules of the test
-bench; gates, tables and risks are plain HTML and are there without scripts, too, to be printed.
+It needs no network and no server: style sheets, scripts and data are inline, and its content
+security policy allows nothing else. The playback runs the test bench's scripts; gates, tables and
+risks are plain HTML, for printing and for browsers without scripts.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from bikeped.templates import render
 from bikeped.web.server import WEB_FOLDER
 
 _FOLDERS = (Path(__file__).parent, WEB_FOLDER)  #: with `static/` and `templates/`, own ones first
-#: In the order in which they need one another.
+#: In the order of their imports.
 _SCRIPTS = (
     "ui.js",
     "canvas.js",
@@ -53,7 +53,7 @@ _SCRIPTS = (
     "report.js",
 )
 _STYLES = ("app.css", "testbench.css", "report.css")
-#: Positions in the file are rounded to centimetres, as no camera is better.
+#: Digits of positions in the file: centimetres.
 _DIGITS = 2
 
 
@@ -61,11 +61,14 @@ def render_report(
     loaded: LoadedConfig,
     scenarios: Sequence[Scenario],
     command: str,
-    tell: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> str:
-    """The page of the configuration in force. `command` makes it again; `tell` counts scenarios."""
+    """The report on the configuration in force.
+
+    `command` is the command line that repeats it; `progress` gets the number of finished scenarios.
+    """
     work = BenchRunner(loaded, scenarios)
-    suite = work.whole(settings_in_force(loaded))
+    suite = work.full_suite(settings_in_force(loaded))
     named = configurations(loaded)
     decision = loaded.config.decision
     found = {
@@ -76,7 +79,7 @@ def render_report(
     plays = []
     for index in range(len(suite.scenarios)):
         plays.append(_play(suite, index, name, named))
-        tell(index + 1)
+        progress(index + 1)
     data = {
         "plays": plays,
         "cameras": [coverage(suite.camera, pose) for pose in suite.poses],

@@ -22,6 +22,7 @@ from msgspec import Meta
 
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.config.docs import key_descriptions
 from bikeped.config.provenance import DECIDING_CODE, code_hash
 from bikeped.config.schema.base import Section
 from bikeped.lab.experiments.optimizer import BOUNDS
@@ -139,7 +140,7 @@ def scenario_json(
     work: BenchRunner, bench: BenchSettings, named: dict[str, DecisionConfig]
 ) -> dict[str, Any]:
     """The playback of the scenario shown, under the bench's decision and those beside it."""
-    suite = work.only(bench)
+    suite = work.shown_suite(bench)
     name = next((n for n, d in named.items() if d == bench.decision), "bench")
     sides = {name: bench.decision}
     for name in bench.beside:
@@ -156,7 +157,7 @@ def scenario_json(
 
 def trials_json(work: BenchRunner, bench: BenchSettings) -> dict[str, Any]:
     """Means over the random trials of the suite; `trials` is null when nobody is missed."""
-    return {"trials": trial_summaries(work.whole(bench), bench)}
+    return {"trials": trial_summaries(work.full_suite(bench), bench)}
 
 
 def script(scenario: Scenario) -> dict[str, Any]:
@@ -186,7 +187,7 @@ def _size(size_m: tuple[float, float, float]) -> dict[str, float]:
 def page_description(work: BenchRunner, named: dict[str, DecisionConfig]) -> dict[str, Any]:
     """What the page loads once: scenarios, configurations, ranges and code hashes."""
     base = settings_in_force(work.loaded)
-    suite: Suite = work.whole(base)
+    suite: Suite = work.full_suite(base)
     return {
         "version": __version__,
         "rule_hash": code_hash(DECIDING_CODE),
@@ -222,11 +223,14 @@ def ranges() -> dict[str, Any]:
         if not (isinstance(section.type, type) and issubclass(section.type, Section)):
             continue
         schema = msgspec.json.schema(section.type)["$defs"][section.type.__name__]
+        meanings: dict[str, str] = {}
+        for kind in section.type.__mro__[: section.type.__mro__.index(Section)]:
+            meanings |= key_descriptions(kind)
         for key, value in schema["properties"].items():
             found[f"{section.name}.{key}"] = {
                 "low": value.get("minimum", value.get("exclusiveMinimum")),
                 "high": value.get("maximum"),
-                "meaning": value.get("description", ""),
+                "meaning": meanings.get(key, ""),
                 "whole": value.get("type") == "integer",
             }
     return found

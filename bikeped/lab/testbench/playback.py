@@ -1,7 +1,7 @@
-"""One scenario, frame by frame: what the pages draw. All numbers are the deployed rule's.
+"""One scenario frame by frame, as the pages draw it, with the numbers of the deployed rule.
 
-Times are frames / 30 s; positions are in the plan (x east, y north, metres), rounded to mm; what is
-not there is null. Arrays run over frames; `start` arrays say where a frame's entries begin.
+Times are frames / 30 s; positions are in the plan (x east, y north, metres), rounded to mm; missing
+values are null. Arrays run over frames; `start` arrays hold the index of a frame's first entry.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _COVER_REACH_M = 40.0
 def playback(
     suite: BenchSuite, index: int, decisions: Mapping[str, DecisionConfig]
 ) -> dict[str, Any]:
-    """Everything about scenario `index`: the plan, what was seen, the truth, and each decision."""
+    """Scenario `index` as JSON data: road users, tracks, ground truth, and each decision."""
     scenario, truth = suite.scenarios[index], suite.truths[index]
     return {
         "scenario": scenario_facts(suite, index),
@@ -51,7 +51,7 @@ def playback(
 
 
 def scenario_facts(suite: BenchSuite, index: int) -> dict[str, Any]:
-    """What a scenario is, in words."""
+    """Name, hazard, vehicle, story and duration of a scenario."""
     scenario = suite.scenarios[index]
     return {
         "name": scenario.name,
@@ -63,8 +63,8 @@ def scenario_facts(suite: BenchSuite, index: int) -> dict[str, Any]:
 
 
 def coverage(camera: GroundCamera, pose: CameraPose) -> dict[str, Any]:
-    """Where the ground is in the picture: by bearing the nearest and the farthest distance, as two
-    outlines in the plan (null where the ground is not seen), and what the picture is like."""
+    """The ground in a camera's view: its nearest and farthest visible points by bearing, as two
+    outlines in the plan (null where no ground is visible), and the camera's pose."""
     bearing = np.linspace(-np.pi, np.pi, _COVER_BEARINGS, endpoint=False)
     reach = np.concatenate([np.arange(0.1, 5, 0.1), np.arange(5, _COVER_REACH_M + 0.1, 0.25)])
     ground = np.stack(
@@ -95,7 +95,7 @@ def coverage(camera: GroundCamera, pose: CameraPose) -> dict[str, Any]:
 
 
 def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
-    """Each agent's true way, and where it was detected in the frame that the tracker gets."""
+    """Each agent's true path, and its detections in the frames that the tracker gets."""
     scenario, scene, seen = (
         suite.scenarios[index],
         suite.shown_detections[index],
@@ -118,10 +118,10 @@ def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
                 "role": Kind(int(seen.kind[a])).label,
                 "size_m": list(agent.size_m),
                 "true": _flat(xy),
-                "heading": _some(heading),
+                "heading": _rounded(heading),
                 "detected": _flat(detected),
                 "missed": _missed(suite, index, a),
-                "error_m": _some(_later(error, late)),
+                "error_m": _rounded(_delayed(error, late)),
                 "path": agent.path.tolist(),
             }
         )
@@ -129,13 +129,13 @@ def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
 
 
 def _missed(suite: BenchSuite, index: int, agent: int) -> list[int]:
-    """1 in frames whose picture shows an agent that the detector missed."""
+    """1 in frames in which the agent is in view and the detector missed it."""
     scene, there = suite.shown_detections[index], suite.perception_results[index].present[:, agent]
     missed = (there & ~scene.detected[:, agent]).astype(float)
-    return [int(v) for v in np.nan_to_num(_later(missed, suite.delay.frames))]
+    return [int(v) for v in np.nan_to_num(_delayed(missed, suite.delay.frames))]
 
 
-def _later(values: FloatArray, frames: int) -> FloatArray:
+def _delayed(values: FloatArray, frames: int) -> FloatArray:
     out = np.full_like(values, np.nan)
     if frames < len(values):
         out[frames:] = values[: len(values) - frames]
@@ -143,7 +143,7 @@ def _later(values: FloatArray, frames: int) -> FloatArray:
 
 
 def _tracks(suite: BenchSuite, index: int) -> dict[str, Any]:
-    """What the tracker reports, as the rules read it, frame after frame."""
+    """The tracks that the rules get, frame by frame."""
     run = suite.rule_input
     frames = run.frame_slice(index)
     first, last = np.searchsorted(run.rows.frame, [frames.start, frames.stop])
@@ -160,12 +160,12 @@ def _tracks(suite: BenchSuite, index: int) -> dict[str, Any]:
 def _truth(truth: GroundTruth) -> dict[str, Any]:
     return {
         "tier": (truth.danger.astype(int) + truth.imminent).tolist(),
-        "distance_m": _some(truth.distance_m),
-        "nearest_m": _some(truth.nearest_m),
-        "d_min_m": _some(truth.d_min_m),
-        "ttc_s": _some(truth.ttc_s),
-        "budget_s": _some(truth.budget_s),
-        "severity": _some(truth.severity),
+        "distance_m": _rounded(truth.distance_m),
+        "nearest_m": _rounded(truth.nearest_m),
+        "d_min_m": _rounded(truth.d_min_m),
+        "ttc_s": _rounded(truth.ttc_s),
+        "budget_s": _rounded(truth.budget_s),
+        "severity": _rounded(truth.severity),
         "cyclist": truth.cyclist.tolist(),
         "pedestrian": truth.pedestrian.tolist(),
     }
@@ -178,7 +178,7 @@ def _closest(truth: GroundTruth) -> float:
 
 
 def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) -> dict[str, Any]:
-    """One decision on the scenario: states, the sentence and the numbers of every frame."""
+    """One decision on the scenario: states, sentences and numbers of every frame."""
     run, settings = suite.rule_input, rule_settings(decision)
     frames = run.frame_slice(index)
     codes = suite.states(decision)
@@ -190,10 +190,10 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
     start = np.searchsorted(pair_frame, np.arange(frames.start, frames.stop + 1))
     kind = run.rows.kind
     row_start = np.searchsorted(run.rows.frame, np.arange(frames.start, frames.stop + 1))
-    walkers = np.add.reduceat(
+    pedestrians = np.add.reduceat(
         np.append(kind == int(Kind.PEDESTRIAN), False), np.minimum(row_start[:-1], len(kind))
     )
-    walkers = np.where(row_start[1:] > row_start[:-1], walkers, 0)
+    pedestrians = np.where(row_start[1:] > row_start[:-1], pedestrians, 0)
     since = run.time_s[frames] - run.cyclist_last_s[frames]
     sentences, chosen = [], []
     for i in range(len(own)):
@@ -205,7 +205,7 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
             if at is None
             else pair_metrics(part.start + at, run.rows, run.pairs, found, settings)
         )
-        sentences.append(explain(state, pair, int(walkers[i]), float(since[i]), settings))
+        sentences.append(explain(state, pair, int(pedestrians[i]), float(since[i]), settings))
         chosen.append(-1 if at is None else part.start + at - int(start[0]))
     alert = own == int(State.ALERT)
     begins = np.nonzero(onsets(alert))[0]
@@ -217,8 +217,8 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
         "state": own.tolist(),
         "sentence": sentences,
         "chosen": chosen,
-        "pedestrians": walkers.tolist(),
-        "since_cyclist_s": _some(since),
+        "pedestrians": pedestrians.tolist(),
+        "since_cyclist_s": _rounded(since),
         "remembered": is_remembered(
             run.time_s[frames], run.cyclist_last_s[frames], settings.memory_s
         ).tolist(),
@@ -250,7 +250,7 @@ def _counts(truth: GroundTruth, alert: BoolArray) -> dict[str, int]:
 
 
 def _pairs(suite: BenchSuite, found: PairChecks, part: slice, start: Any) -> dict[str, Any]:
-    """The numbers and the tests of every pair of every frame; `passes` holds a bit a test."""
+    """Numbers and checks of every pair of every frame; `passes` has one bit for each check."""
     run = suite.rule_input
     cyclist = run.pairs.cyclist_row[run.pairs.cyclist[part]]
     pedestrian = run.pairs.pedestrian_row[part]
@@ -263,13 +263,13 @@ def _pairs(suite: BenchSuite, found: PairChecks, part: slice, start: Any) -> dic
         "cyclist": run.rows.id[cyclist].tolist(),
         "pedestrian": run.rows.id[pedestrian].tolist(),
         "passes": bits.tolist(),
-        "distance_m": _some(found.distance_m[part]),
-        "then_m": _some(found.distance_then_m[part]),
-        "lookback_s": _some(found.lookback_s[part]),
-        "displacement_m": _some(found.displacement_m[part]),
-        "speed_mps": _some(found.speed_mps[part]),
-        "d_max_m": _some(found.d_max_m[part]),
-        "reach_m": _some(reach),
+        "distance_m": _rounded(found.distance_m[part]),
+        "then_m": _rounded(found.distance_then_m[part]),
+        "lookback_s": _rounded(found.lookback_s[part]),
+        "displacement_m": _rounded(found.displacement_m[part]),
+        "speed_mps": _rounded(found.speed_mps[part]),
+        "d_max_m": _rounded(found.d_max_m[part]),
+        "reach_m": _rounded(reach),
     }
 
 
@@ -285,12 +285,12 @@ TESTS = {
 }
 
 
-def _some(values: FloatArray) -> list[float | None]:
-    """Numbers with three decimals; null where there is none."""
+def _rounded(values: FloatArray) -> list[float | None]:
+    """Numbers with three decimals; null where not finite."""
     rounded = np.round(values, 3).tolist()
     return [v if v - v == 0 else None for v in rounded]
 
 
 def _flat(xy: FloatArray) -> list[float | None]:
     """[x0, y0, x1, y1, ...]."""
-    return _some(np.asarray(xy).reshape(-1))
+    return _rounded(np.asarray(xy).reshape(-1))

@@ -1,9 +1,8 @@
-"""The suite under a bench's setting, by the very code of the conformance commands.
+"""Runs the suite under the test bench's settings, with the code of the conformance commands.
 
-`BenchSuite` is a `Suite` whose track rows come from the bench's perception: a second camera, missed
-detections, latency, prediction. Everything that is asked of it (states, truth, metrics, gates,
-contest) is `conformance`'s own. With the configuration in force it gives what
-`bikeped conformance compare` gives, to the last digit.
+`BenchSuite` is a `Suite` whose tracks come from the settings' perception: a second camera, missed
+detections, latency, prediction. States, ground truth, metrics and gates are those of `Suite`. With
+the configuration in force the figures equal those of `bikeped conformance compare`.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -51,13 +50,13 @@ from bikeped.lab.testbench.settings import (
 
 T = TypeVar("T")
 
-#: Frames times lanes times slots that one answer may take: some five seconds of a small computer.
+#: Largest frames x scenarios x track slots of one answer: about five seconds on a small computer.
 MOST_WORK = 4_000_000
 
 
 @dataclass(frozen=True)
 class BenchSuite(Suite):
-    """A suite as one bench sees it. `second` is a further camera of the same kind and mount."""
+    """A suite under the bench's perception and delay; `second` is a camera of the same mount."""
 
     perception: Perception = field(default_factory=Perception)
     delay: Delay = field(default_factory=Delay)
@@ -161,7 +160,7 @@ def check_work(scenarios: Sequence[Scenario], repeats: int = 1) -> None:
 
 
 class BenchRunner:
-    """Runs benches, and keeps what the last ones have in common. One at a time, in any thread."""
+    """Runs the suite under changing settings and caches what they share. Thread-safe by a lock."""
 
     def __init__(self, loaded: LoadedConfig, scenarios: Sequence[Scenario]) -> None:
         self.loaded, self.scenarios = loaded, tuple(scenarios)
@@ -169,44 +168,39 @@ class BenchRunner:
         self._seen: _LruCache[PerceptionResult] = _LruCache(400)
         self._truths: _LruCache[GroundTruth] = _LruCache(400)
         self._suites: _LruCache[BenchSuite] = _LruCache(12)
-        self._own: _LruCache[Scenario] = _LruCache(60)
-        self.lock = threading.RLock()
+        self._parse = lru_cache(60)(parse_custom_scenario)  # parsing YAML is slow
+        self._lock = threading.Lock()
 
     def suite_scenarios(self, bench: BenchSettings) -> tuple[Scenario, ...]:
-        """The suite with the bench's own scenarios, as `conformance contest --scenario` adds them:
-        one of a name that is there takes its place."""
-        with self.lock:
-            own = {s.name: s for s in custom_scenarios(bench, self._read)}
-        kept = [own.pop(s.name, s) for s in self.scenarios]
-        return (*kept, *own.values())
+        """The suite with the custom scenarios, as `conformance contest --scenario` adds them: one
+        with the name of a bundled scenario replaces it."""
+        custom = custom_scenarios(bench, self._parse)
+        bundled = [custom.pop(s.name, s) for s in self.scenarios]
+        return (*bundled, *custom.values())
 
-    def _read(self, text: str, source: str) -> Scenario:
-        """As `parse_custom_scenario`, with a cache by text: parsing YAML is slow."""
-        return self._own.get(text, lambda: parse_custom_scenario(text, source))
-
-    def whole(self, bench: BenchSettings) -> BenchSuite:
-        """The bench's suite."""
+    def full_suite(self, bench: BenchSettings) -> BenchSuite:
+        """The suite of all scenarios."""
         return self._suite(bench, self.suite_scenarios(bench))
 
-    def only(self, bench: BenchSettings) -> BenchSuite:
-        """A suite of the one scenario that the bench shows."""
-        everyone = self.suite_scenarios(bench)
+    def shown_suite(self, bench: BenchSettings) -> BenchSuite:
+        """A suite of the scenario shown only."""
+        scenarios = self.suite_scenarios(bench)
         if not bench.scenario:
-            return self._suite(bench, everyone[:1])
-        found = tuple(s for s in everyone if s.name == bench.scenario)
+            return self._suite(bench, scenarios[:1])
+        found = tuple(s for s in scenarios if s.name == bench.scenario)
         if not found:
-            raise BikepedError(f"scenario {bench.scenario!r}: is not there; choose another")
+            raise BikepedError(f"scenario {bench.scenario!r}: does not exist; choose another")
         return self._suite(bench, found)
 
     def _suite(self, bench: BenchSettings, scenarios: tuple[Scenario, ...]) -> BenchSuite:
         check_work(scenarios)
-        with self.lock:
+        with self._lock:
             camera = camera_with_mount(self.loaded, bench.camera)
             pose = bench.camera.pose()
             second = None if bench.second_camera is None else bench.second_camera.pose()
             texts = [self._text(s) for s in scenarios]
             where = msgspec.json.encode(bench.camera)
-            # How many trials are averaged changes nothing of the one that is shown.
+            # The number of trials that are averaged does not change the one that is shown.
             perception = msgspec.structs.replace(bench.perception, trials=1)
             key = (*texts, where, msgspec.json.encode([perception, bench.delay]), str(second))
 
@@ -223,25 +217,25 @@ class BenchRunner:
                 return suite
 
             suite = self._suites.get(key, make)
-            suite.rule_input  # noqa: B018 - computed now, and shared by what follows
+            suite.rule_input  # noqa: B018 - computed before the copy, which shares it
             settings = bench.danger.settings()
-            told = suite.with_truth(settings)
-            told.__dict__["truths"] = tuple(
+            with_truth = suite.with_truth(settings)
+            with_truth.__dict__["truths"] = tuple(
                 self._truths.get(
                     (text, settings), partial(compute_ground_truth, scenario, settings)
                 )
                 for text, scenario in zip(texts, scenarios, strict=True)
             )
-            return told
+            return with_truth
 
     def _text(self, scenario: Scenario) -> str:
-        """A key of the scenario's contents."""
-        known = self._texts.get(id(scenario))  # those are kept, so no other has their id
+        """The scenario as YAML: its cache key."""
+        known = self._texts.get(id(scenario))  # bundled ones, whose ids stay taken
         return dump_scenario(scenario) if known is None else known
 
 
 class _LruCache(Generic[T]):
-    """The last `most` values, made when they are asked for the first time."""
+    """The last `most` values by key."""
 
     def __init__(self, most: int) -> None:
         self._most = most

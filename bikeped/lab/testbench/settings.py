@@ -8,16 +8,16 @@ configuration in force) and as a file (`bikeped testbench contest FILE`), withou
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl, quote, urlsplit
 
 import msgspec
 from msgspec import Meta
 
-from bikeped.config import CameraConfig, DecisionConfig, LoadedConfig, ground_camera
+from bikeped.config import DecisionConfig, LoadedConfig, ground_camera
 from bikeped.config.schema.base import Section
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.geometry import CameraPose, GroundCamera
@@ -26,7 +26,7 @@ from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
 from bikeped.lab.simulation.perception import SIMULATION_POSE, RecallModel
 from bikeped.lab.simulation.truth import GroundTruthSettings
 
-#: A script of somebody's own: what the page draws in a moment, not what a batch computes.
+#: Limits of custom scenarios: what one answer can simulate within a second.
 MAX_SCRIPTS = 30
 MAX_SCRIPT_CHARS = 60_000
 MAX_AGENTS = 40
@@ -36,54 +36,51 @@ _MAX_LINK_CHARS = 900_000
 
 
 class Pose(Section, frozen=True):
-    """Where a camera stands in the plan and where it looks."""
+    """Position and heading of a camera in the plan."""
 
-    x_m: Annotated[float, Meta(ge=-100, le=100, description="east, m")]
-    y_m: Annotated[float, Meta(ge=-100, le=100, description="north, m")]
-    heading_deg: Annotated[
-        float, Meta(ge=-360, le=360, description="from east, counter-clockwise, degrees")
-    ]
+    x_m: Annotated[float, Meta(ge=-100, le=100)]
+    """east, m"""
+    y_m: Annotated[float, Meta(ge=-100, le=100)]
+    """north, m"""
+    heading_deg: Annotated[float, Meta(ge=-360, le=360)]
+    """from east, counter-clockwise, degrees"""
 
     def pose(self) -> CameraPose:
         return CameraPose(self.x_m, self.y_m, self.heading_deg)
 
 
 class Mount(Pose, frozen=True):
-    """How the camera hangs; the lens, its circle and its centre are the configuration's."""
+    """The camera's mount; the other parameters of the lens are the configuration's."""
 
-    height_m: Annotated[float, Meta(ge=1, le=15, description="above the ground, m")]
-    pitch_deg: Annotated[float, Meta(ge=-90, le=30, description="0 level, -90 straight down")]
-    fov_deg: Annotated[float, Meta(ge=30, le=240, description="field of view, degrees")]
+    height_m: Annotated[float, Meta(ge=1, le=15)]
+    """above the ground, m"""
+    pitch_deg: Annotated[float, Meta(ge=-90, le=30)]
+    """0 level, -90 straight down"""
+    fov_deg: Annotated[float, Meta(ge=30, le=240)]
+    """field of view, degrees"""
 
 
 class Perception(Section, frozen=True):
-    """What the camera misses and misplaces."""
+    """Position errors and missed detections."""
 
-    localisation_error: Annotated[
-        bool, Meta(description="place people where the camera would, not where they are")
-    ] = True
-    recall: Annotated[
-        Literal["all", "size", "kind", "fixed"],
-        Meta(
-            description="all: nobody is missed; size: recall measured by size in the picture; "
-            "kind: the measured overall recall of each kind; fixed: the number below"
-        ),
-    ] = "all"
-    recall_value: Annotated[
-        float, Meta(ge=0.05, le=1, description="share of detections that are made, with fixed")
-    ] = 0.75
-    burst_frames: Annotated[
-        float | None,
-        Meta(description="mean length of a run of misses, frames; null: independent misses"),
-    ] = None
-    seed: Annotated[int, Meta(ge=0, le=2**31, description="seed of the misses")] = 0
-    trial: Annotated[int, Meta(ge=0, le=999, description="which random trial is shown")] = 0
-    trials: Annotated[
-        int, Meta(ge=1, le=50, description="trials over which the suite's means are taken")
-    ] = 10
+    localisation_error: bool = True
+    """use the positions that the camera measures, not the true ones"""
+    recall: Literal["all", "size", "kind", "fixed"] = "all"
+    """all: no misses; size: recall measured by size in the picture; kind: the measured overall
+    recall of each kind; fixed: the number below"""
+    recall_value: Annotated[float, Meta(ge=0.05, le=1)] = 0.75
+    """share of detections that are made, with fixed"""
+    burst_frames: Annotated[float, Meta(ge=1, le=1000)] | None = None
+    """mean length of a run of misses, frames; null: independent misses"""
+    seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
+    """seed of the misses"""
+    trial: Annotated[int, Meta(ge=0, le=999)] = 0
+    """which random trial is shown"""
+    trials: Annotated[int, Meta(ge=1, le=50)] = 10
+    """trials over which the suite's means are taken"""
 
     def model(self) -> RecallModel | None:
-        """The recall model; None when nobody is missed."""
+        """The recall model; None without misses."""
         if self.recall == "all":
             return None
         if self.recall == "fixed":
@@ -92,13 +89,12 @@ class Perception(Section, frozen=True):
 
 
 class Delay(Section, frozen=True):
-    """Camera latency, and how far tracks are carried over it."""
+    """Camera latency, and the prediction of tracks over it."""
 
-    delay_ms: Annotated[float, Meta(ge=0, le=1000, description="age of every picture, ms")] = 0.0
-    order: Annotated[
-        Literal[0, 1, 2],
-        Meta(description="prediction over the delay: 0 none, 1 velocity, 2 acceleration too"),
-    ] = 0
+    delay_ms: Annotated[float, Meta(ge=0, le=1000)] = 0.0
+    """age of every picture, ms"""
+    order: Literal[0, 1, 2] = 0
+    """prediction over the delay: 0 none, 1 velocity, 2 acceleration too"""
 
     @property
     def frames(self) -> int:
@@ -108,20 +104,14 @@ class Delay(Section, frozen=True):
 class GroundTruthThresholds(Section, frozen=True):
     """The free thresholds of the ground truth (definitions, section 5)."""
 
-    cpa_radius_m: Annotated[
-        float, Meta(gt=0, le=25, description="a pair that will come nearer than this, m")
-    ] = 5.0
-    stopping_margin: Annotated[
-        float, Meta(gt=0, le=10, description="share of the gap that stopping must leave")
-    ] = 0.8
-    ttc_bound_s: Annotated[
-        Annotated[float, Meta(gt=0, le=60)] | None,
-        Meta(description="time to contact below which danger holds, s; null: 1.87 s + clearance"),
-    ] = None
-    braking: Annotated[
-        Literal["bicycle", "ebike", "aashto"] | None,
-        Meta(description="braking of all cyclists; null: by the scenario's vehicle"),
-    ] = None
+    cpa_radius_m: Annotated[float, Meta(gt=0, le=25)] = 5.0
+    """largest distance at the closest approach that is dangerous, m"""
+    stopping_margin: Annotated[float, Meta(gt=0, le=10)] = 0.8
+    """share of the gap that the stopping distance must reach"""
+    ttc_bound_s: Annotated[float, Meta(gt=0, le=60)] | None = None
+    """time to contact below which danger holds, s; null: 1.87 s + clearance"""
+    braking: Literal["bicycle", "ebike", "aashto"] | None = None
+    """braking of all cyclists; null: by the scenario's vehicle"""
 
     def settings(self) -> GroundTruthSettings:
         return GroundTruthSettings(
@@ -130,7 +120,7 @@ class GroundTruthThresholds(Section, frozen=True):
 
 
 class BenchSettings(Section, frozen=True):
-    """One setting of the whole bench."""
+    """All settings of the test bench."""
 
     camera: Mount
     decision: DecisionConfig = msgspec.field(default_factory=DecisionConfig)
@@ -139,27 +129,24 @@ class BenchSettings(Section, frozen=True):
     danger: GroundTruthThresholds = msgspec.field(default_factory=GroundTruthThresholds)
     second_camera: Pose | None = None
     scenario: Annotated[str, Meta(max_length=200)] = ""  #: the one shown; empty: the first
-    #: Named configurations that are shown beside the bench's decision.
+    #: Named configurations that are shown beside `decision`.
     beside: Annotated[tuple[Annotated[str, Meta(max_length=60)], ...], Meta(max_length=2)] = ()
-    #: Scenarios of one's own (texts of scenario files); one of a name that is there replaces it.
+    #: Texts of custom scenario files; one with a bundled scenario's name replaces it.
     scripts: Annotated[
         tuple[Annotated[str, Meta(max_length=MAX_SCRIPT_CHARS)], ...], Meta(max_length=MAX_SCRIPTS)
     ] = ()
 
 
 def settings_in_force(loaded: LoadedConfig) -> BenchSettings:
-    """The bench that changes nothing: the configuration's decision and camera, where the paper's
-    simulation camera stands."""
+    """The settings without changes: the configuration's decision and camera, at the position of the
+    paper's simulation camera."""
     camera = ground_camera(loaded)
     fov_deg = loaded.config.camera.fov_deg
     if fov_deg is None and loaded.calibration is not None:
         fov_deg = loaded.calibration.fov_deg
-    pose = SIMULATION_POSE
     return BenchSettings(
         camera=Mount(
-            x_m=pose.x_m,
-            y_m=pose.y_m,
-            heading_deg=pose.heading_deg,
+            **dataclasses.asdict(SIMULATION_POSE),
             height_m=camera.height_m,
             pitch_deg=camera.pitch_deg,
             fov_deg=fov_deg or 180.0,
@@ -169,71 +156,54 @@ def settings_in_force(loaded: LoadedConfig) -> BenchSettings:
 
 
 def camera_with_mount(loaded: LoadedConfig, mount: Mount) -> GroundCamera:
-    """The configuration's camera, hung as `mount` says: as `--set camera.height_m=...` makes it."""
-    return ground_camera(config_with_mount(loaded, mount))
+    """The configuration's camera with the mount's height, pitch and field of view.
 
-
-def config_with_mount(loaded: LoadedConfig, mount: Mount) -> LoadedConfig:
-    """The configuration with this height, pitch and field of view."""
-    changed = {
-        key: value
-        for key, value in (
-            ("height_m", mount.height_m),
-            ("pitch_deg", mount.pitch_deg),
-            ("fov_deg", mount.fov_deg),
-        )
-        if value != getattr(settings_in_force(loaded).camera, key)
-    }
-    if not changed:
-        return loaded
-    camera: CameraConfig = msgspec.structs.replace(loaded.config.camera, **changed)
+    The same camera as `--set camera.height_m=...` and so on give.
+    """
+    before = settings_in_force(loaded).camera
+    keys = ("height_m", "pitch_deg", "fov_deg")
+    changed = {k: getattr(mount, k) for k in keys if getattr(mount, k) != getattr(before, k)}
+    camera = msgspec.structs.replace(loaded.config.camera, **changed)
     config = msgspec.structs.replace(loaded.config, camera=camera)
-    return replace(loaded, config=config)
+    return ground_camera(dataclasses.replace(loaded, config=config))
 
 
 def check_settings(bench: BenchSettings) -> BenchSettings:
-    """What single ranges cannot say; BikepedError names the key and the mend."""
+    """Checks keys against one another; BikepedError names key and remedy."""
     decision = bench.decision
     if decision.d_min_m > decision.d_max_m:
         raise BikepedError(
             f"decision.d_min_m: {decision.d_min_m:g} is above decision.d_max_m "
             f"{decision.d_max_m:g}; exchange them"
         )
-    burst = bench.perception.burst_frames
-    if burst is not None and not 1 <= burst <= 1000:
-        raise BikepedError(f"perception.burst_frames: {burst:g} is not 1 to 1000 frames")
     return bench
 
 
 def custom_scenarios(
-    bench: BenchSettings, read: Callable[[str, str], Scenario] | None = None
-) -> list[Scenario]:
-    """The scenarios that came with the bench, checked as files are, and small enough for a page.
-
-    `read` stands in for `parse_custom_scenario`, e.g. to keep what was read.
-    """
-    found = [
-        (read or parse_custom_scenario)(text, f"scenario {number}")
-        for number, text in enumerate(bench.scripts, 1)
-    ]
-    names = [s.name for s in found]
-    twice = next((n for n in names if names.count(n) > 1), None)
-    if twice is not None:
-        raise ScenarioError(f"scenario {twice!r}: is there twice; give each its own name")
+    bench: BenchSettings, parse: Callable[[str, str], Scenario]
+) -> dict[str, Scenario]:
+    """The custom scenarios by name, each from `parse(text, source)`; ScenarioError when two share a
+    name."""
+    found: dict[str, Scenario] = {}
+    for number, text in enumerate(bench.scripts, 1):
+        scenario = parse(text, f"scenario {number}")
+        if scenario.name in found:
+            raise ScenarioError(f"scenario {scenario.name!r}: occurs twice; rename one of them")
+        found[scenario.name] = scenario
     return found
 
 
 def parse_custom_scenario(text: str, source: str) -> Scenario:
-    """A scenario from a page; ScenarioError when it is wrong, or too large to answer at once."""
+    """A custom scenario; ScenarioError when it is invalid or exceeds the limits of the page."""
     scenario = parse_scenario(text, source)
     if len(scenario.agents) > MAX_AGENTS:
         raise ScenarioError(
-            f"{source}: agents: {len(scenario.agents)} are too many for the page, which takes "
-            f"{MAX_AGENTS}; use bikeped conformance run --scenarios"
+            f"{source}: agents: {len(scenario.agents)} are too many for the page (at most "
+            f"{MAX_AGENTS}); use bikeped conformance run --scenarios"
         )
     if scenario.duration_s > MAX_DURATION_S:
         raise ScenarioError(
-            f"{source}: lasts {scenario.duration_s:g} s and the page takes {MAX_DURATION_S:g} s; "
+            f"{source}: lasts {scenario.duration_s:g} s, the page takes {MAX_DURATION_S:g} s; "
             "use bikeped conformance run --scenarios"
         )
     if any(abs(agent.path[:, 1:]).max() > MAX_COORDINATE_M for agent in scenario.agents):
@@ -245,7 +215,7 @@ def parse_custom_scenario(text: str, source: str) -> Scenario:
 
 
 def settings_to_link(bench: BenchSettings, base: BenchSettings) -> str:
-    """What differs from `base` as `key=value&...`, readable: `decision.d_max_m=15`."""
+    """The keys that differ from `base` as `key=value&...`, e.g. `decision.d_max_m=15`."""
     return "&".join(
         f"{key}={quote(_text(value), safe='')}" for key, _, value in differing_keys(bench, base)
     )
@@ -273,9 +243,9 @@ def differing_keys(bench: BenchSettings, base: BenchSettings) -> list[tuple[str,
 
 
 def settings_from_link(link: str, base: BenchSettings) -> BenchSettings:
-    """The bench of a link: a whole address or only what follows its `#`.
+    """The settings of a link: a whole address or what follows its `#`.
 
-    BikepedError names the key and the mend.
+    BikepedError names key and remedy.
     """
     if len(link) > _MAX_LINK_CHARS:
         raise BikepedError("link: too long; use the file instead")
@@ -289,7 +259,7 @@ def settings_from_link(link: str, base: BenchSettings) -> BenchSettings:
         section, dot, name = key.partition(".")
         place = data.get(section) if dot else data
         if not isinstance(place, dict) or (name if dot else key) not in place:
-            raise BikepedError(f"link: {key[:60]}: there is no such setting; copy the link anew")
+            raise BikepedError(f"link: {key[:60]}: there is no such setting; copy the link again")
         place[name if dot else key] = _value(value, key)
     return _bench(data, "link")
 
@@ -311,7 +281,7 @@ def _no_number(name: str) -> Any:
 
 
 def settings_to_file(bench: BenchSettings, base: BenchSettings, facts: dict[str, Any]) -> str:
-    """A challenge as a file: all settings, and what they were measured against."""
+    """A file of all settings, with the hashes that they were measured with."""
     data = {
         "format": 1,
         **facts,
@@ -322,13 +292,15 @@ def settings_to_file(bench: BenchSettings, base: BenchSettings, facts: dict[str,
 
 
 def settings_from_file(text: str | bytes, source: str) -> BenchSettings:
-    """The bench of a challenge's file; BikepedError names the file, the key and the mend."""
+    """The settings of a saved file; BikepedError names file, key and remedy."""
     try:
         data = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
-        raise BikepedError(f"{source}: is not JSON ({error}); save the challenge anew") from error
+        raise BikepedError(
+            f"{source}: is not JSON ({error}); save the file again in the test bench"
+        ) from error
     if not isinstance(data, dict) or data.get("format") != 1 or "bench" not in data:
-        raise BikepedError(f"{source}: is no challenge of the test bench; save it there")
+        raise BikepedError(f"{source}: is not a file of the test bench; save it there")
     return _bench(data["bench"], source)
 
 

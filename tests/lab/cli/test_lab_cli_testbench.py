@@ -162,7 +162,7 @@ def test_the_command_serves_until_it_is_told_to_end():
         line = process.stdout.readline()
         address = next(word for word in line.split() if word.startswith("http"))
         with urllib.request.urlopen(address, timeout=30) as answer:
-            assert "How it decides" in answer.read().decode()
+            assert "Pipeline in this frame" in answer.read().decode()
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=30)

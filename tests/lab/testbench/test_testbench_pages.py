@@ -88,7 +88,7 @@ async def test_the_suite_agrees_with_compare(compared, error):
 def test_latency_and_prediction_agree_with_the_sweep(work, suite, order):
     data = sweep(suite, BASE.decision, (198,)).data
     lists = data[("none", "first", "second")[order]]
-    one = work.whole(bench(delay={"delay_ms": 198.0, "order": order}))
+    one = work.full_suite(bench(delay={"delay_ms": 198.0, "order": order}))
     figures = one.measure(BASE.decision).as_dict()
     assert {key: [figures[key]] for key in lists} == lists
 
@@ -101,7 +101,7 @@ def test_trials_agree_with_monte_carlo(work, suite, recall, mode):
     )
     plan = LossModel(RecallModel(mode), 5.0, ((2, 1),))
     found = simulate_suite_trials(sorted_suite(suite), plan, {"": BASE.decision}, range(2), 3)
-    assert trial_summaries(work.whole(asked), asked) == {
+    assert trial_summaries(work.full_suite(asked), asked) == {
         "trials": 2,
         **summarize_metrics(found[2, 1][""]),
     }
@@ -109,12 +109,12 @@ def test_trials_agree_with_monte_carlo(work, suite, recall, mode):
 
 def test_a_fixed_share_of_everybody_is_seen(work):
     asked = bench("Bike Approaches Ped", perception={"recall": "fixed", "recall_value": 1.0})
-    all_seen = work.only(asked)
+    all_seen = work.shown_suite(asked)
     assert (
         all_seen.shown_detections[0].detected.tolist()
         == all_seen.perception_results[0].present.tolist()
     )
-    half = work.only(
+    half = work.shown_suite(
         bench("Bike Approaches Ped", perception={"recall": "fixed", "recall_value": 0.5})
     )
     share = half.shown_detections[0].detected.sum() / half.perception_results[0].present.sum()
@@ -127,7 +127,7 @@ def test_a_fixed_share_of_everybody_is_seen(work):
 @pytest.mark.parametrize("rule", ["selected", "ttc", "distance_only", "narrow"])
 def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
     decision = CONFIGURATIONS[rule]
-    one = work.only(bench(name))
+    one = work.shown_suite(bench(name))
     play = playback(one, 0, {rule: decision})
     side = play["sides"][0]
     decider, rows = Decider(rule_settings(decision)), one.rule_input.rows
@@ -148,7 +148,7 @@ def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
 
 
 def test_a_pair_fires_when_all_its_tests_pass(work):
-    play = playback(work.only(bench("Multi-Speed Converging")), 0, {"": DecisionConfig()})
+    play = playback(work.shown_suite(bench("Multi-Speed Converging")), 0, {"": DecisionConfig()})
     pairs = play["sides"][0]["pairs"]
     bits = {test: 1 << i for i, test in enumerate(TESTS)}
     fired = 0
@@ -162,10 +162,10 @@ def test_a_pair_fires_when_all_its_tests_pass(work):
 def test_a_second_camera_sees_what_the_first_cannot(work):
     asked = bench("Bike Approaches Ped", camera={"height_m": 2.0, "pitch_deg": -60.0})
     both = msgspec.structs.replace(asked, second_camera=Pose(x_m=5.0, y_m=13.0, heading_deg=270.0))
-    one, two = work.only(asked), work.only(both)
+    one, two = work.shown_suite(asked), work.shown_suite(both)
     lossy = bench(base=both, scenario=both.scenario, perception={"recall": "size"})
     assert len(two.poses) == 2
-    assert (work.only(lossy).observed[0].recall >= 0.5).all()
+    assert (work.shown_suite(lossy).observed[0].recall >= 0.5).all()
     assert not np.array_equal(one.observed[0].xy_m, two.observed[0].xy_m, equal_nan=True)
 
 
@@ -176,11 +176,11 @@ def test_the_camera_is_hung_as_the_command_line_hangs_it(work):
         overrides=("camera.height_m=5.5", "camera.pitch_deg=-30", "camera.fov_deg=150")
     )
     asked = bench("", camera={"height_m": 5.5, "pitch_deg": -30.0, "fov_deg": 150.0})
-    assert work.only(asked).camera == ground_camera(by_hand)
+    assert work.shown_suite(asked).camera == ground_camera(by_hand)
 
 
 def test_coverage_is_the_ground_that_the_camera_projects(work):
-    one = work.only(bench("", camera={"pitch_deg": -40.0, "fov_deg": 90.0}))
+    one = work.shown_suite(bench("", camera={"pitch_deg": -40.0, "fov_deg": 90.0}))
     told = coverage(one.camera, one.pose)
     far = np.asarray(told["far"], float).reshape(-1, 2)
     near = np.asarray(told["near"], float).reshape(-1, 2)
@@ -194,13 +194,13 @@ def test_coverage_is_the_ground_that_the_camera_projects(work):
 
 def test_own_scenarios_join_the_suite_or_take_a_place(work):
     joined = msgspec.structs.replace(BASE, scripts=(OWN,), scenario="My crossing")
-    assert work.whole(joined).names[-1] == "My crossing"
-    assert work.only(joined).names == ("My crossing",)
+    assert work.full_suite(joined).names[-1] == "My crossing"
+    assert work.shown_suite(joined).names == ("My crossing",)
     instead = msgspec.structs.replace(
         BASE, scripts=(OWN.replace("My crossing", "Safe Crossing"),), scenario="Safe Crossing"
     )
-    assert len(work.whole(instead).names) == len(SCENARIOS)
-    assert len(work.only(instead).scenarios[0].agents) == 2
+    assert len(work.full_suite(instead).names) == len(SCENARIOS)
+    assert len(work.shown_suite(instead).scenarios[0].agents) == 2
 
 
 def test_what_was_kept_is_not_mistaken_for_something_else(work):
@@ -218,7 +218,7 @@ def test_what_was_kept_is_not_mistaken_for_something_else(work):
     few = [s for s in SCENARIOS if s.name == "Swerving Cyclist"]
 
     def figures(workbench, one):
-        suite = workbench.whole(one)
+        suite = workbench.full_suite(one)
         tracks = hashlib.sha256(suite.rule_input.rows.xy_m.tobytes()).hexdigest()
         return tracks, suite.truths[0].danger.sum(), repr(suite.measure(one.decision).as_dict())
 

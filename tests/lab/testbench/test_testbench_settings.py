@@ -149,7 +149,7 @@ def test_a_bad_scenario_is_refused_in_words(text, says):
 
 def test_two_scenarios_of_one_name_are_refused():
     with pytest.raises(ScenarioError, match="twice"):
-        custom_scenarios(msgspec.structs.replace(BASE, scripts=(OWN, OWN)))
+        custom_scenarios(msgspec.structs.replace(BASE, scripts=(OWN, OWN)), parse_custom_scenario)
 
 
 def test_the_page_s_ranges_are_those_that_are_checked():
@@ -183,7 +183,7 @@ async def test_requests_that_are_wrong_are_refused_and_touch_no_file():
             asked = json.dumps({"bench": {**whole, "scenario": name}}).encode()
             code, text = await status("scenario", asked, **kind)
             assert code == 400
-            assert "is not there" in text
+            assert "does not exist" in text
             assert "root:" not in text
         extra = json.dumps({"bench": {**whole, "folder": "/etc"}}).encode()
         assert (await status("scenario", extra, **kind))[0] == 400

@@ -17,7 +17,7 @@ const GROUPS = [
     ["decision.memory_frames", "memory N", "frames", 0, 120, 1],
     ["decision.d_min_m", "nearest d_min", "m", 0.5, 5, 0.1],
     ["decision.d_max_m", "farthest d_max", "m", 5, 25, 0.1],
-    ["decision.min_displacement_m", "shortest displacement δ_min", "m", 0, 0.5, 0.001],
+    ["decision.min_displacement_m", "displacement δ_min", "m", 0, 0.5, 0.001],
     ["decision.lookback_frames", "lookback k", "frames", 1, 10, 1],
     ["decision.speed_adaptive", "d_max grows with speed", "switch"],
     ["decision.ttc_s", "bound (rule time to collision)", "s", 0.5, 8, 0.1],
