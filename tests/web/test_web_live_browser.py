@@ -230,7 +230,7 @@ def test_every_state_has_a_word_a_shape_and_a_reason(told, open_page, assert_acc
     expect(page.locator("#state-sentence")).to_have_text("Because of this")
     expect(page.locator("#state-mark svg")).to_have_count(1)
     expect(page).to_have_title(f"{name.capitalize()} · Live · bikeped")
-    expect(page.locator("#dispatcher")).to_contain_text(name.capitalize())
+    expect(page.locator("#announcer")).to_contain_text(name.capitalize())
     assert_accessible(page)
 
 
@@ -296,7 +296,7 @@ def test_a_dead_server_leaves_no_reassuring_colour(told, open_page, page_errors)
     safe = page.evaluate("getComputedStyle(document.querySelector('#state')).backgroundColor")
     told.served.stop()
     expect(page.locator("#state-word")).to_have_text("No contact")
-    expect(page.locator("#dispatcher")).to_contain_text("No contact")
+    expect(page.locator("#announcer")).to_contain_text("No contact")
     grey = page.evaluate("getComputedStyle(document.querySelector('#state')).backgroundColor")
     assert grey != safe
     red, green, blue = map(int, re.findall(r"\d+", grey)[:3])
