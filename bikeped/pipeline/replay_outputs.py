@@ -6,7 +6,6 @@ import asyncio
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -17,7 +16,6 @@ from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.events import EventWriter
-from bikeped.telemetry.schema import EventHeader
 from bikeped.types import Kind, State
 
 OVERLAY_SIZE = (1600, 720)
@@ -62,17 +60,11 @@ class ReplaySummary:
         self.progress(self.frames)
 
 
-class EventFile:
-    """The event file of a replay; it appears when it is whole, and not at all after an error."""
-
-    def __init__(self, path: Path, header: EventHeader) -> None:
-        self._writer = EventWriter(path, header)
+class EventFile(EventWriter):
+    """The event file of a replay; nothing is left of it after an error."""
 
     async def on_frame_result(self, result: FrameResult) -> None:
-        self._writer.write(event_line_for(result))
-
-    def __enter__(self) -> EventFile:
-        return self
+        self.write(event_line_for(result))
 
     def __exit__(
         self,
@@ -80,9 +72,9 @@ class EventFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._writer.__exit__(kind, error, trace)
+        super().__exit__(kind, error, trace)
         if error is not None:
-            self._writer.partial_path.unlink(missing_ok=True)
+            self.partial_path.unlink(missing_ok=True)
 
 
 class OverlayVideo:

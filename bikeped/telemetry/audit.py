@@ -1,8 +1,7 @@
-"""The audit log: event lines appended by a thread of their own, rotated, never in the way.
+"""The audit log: event lines appended and rotated by a thread of its own.
 
-`write` only puts a line aside. The thread writes what waits. When it cannot (disk full, too little
-room, read-only, directory gone) it says so in `fault` and tries again until it can; meanwhile the
-queue keeps the newest lines and counts the rest.
+`write` only queues a line. While the thread cannot write (disk full or read-only, directory gone)
+it sets `fault` and tries again; meanwhile the queue keeps the newest lines and counts the rest.
 """
 
 from __future__ import annotations
@@ -27,15 +26,12 @@ MB = 1_000_000  #: bytes
 
 
 class AuditLog:
-    """Appends event lines to `config.path`; with no path it does nothing.
+    """Appends event lines to `config.path`; does nothing without a path. No method raises OSError.
 
-    Every new file begins with `header`, and so does every later run in the same file, or what
-    follows an interruption. At `max_mb` the file becomes `<name>.1`, the former `.1` becomes `.2`,
-    and so on up to `keep`. `queue_size` lines wait at most, `retry_s` is the pause after a failure,
-    `sync_s` the time between two fsyncs (what a power cut may cost). `free_bytes` tells the room on
-    a directory's disk.
-
-    The thread starts with `start`. No method raises for what the disk does.
+    `header` is written whenever a file is opened. At `max_mb` the file becomes `<name>.1`, the
+    former `.1` becomes `.2`, and so on up to `keep`. `queue_size` bounds the lines that wait,
+    `retry_s` is the pause after a failure, `sync_s` the time between two fsyncs (what a power cut
+    may cost). `free_bytes` returns the free bytes on a directory's disk.
     """
 
     def __init__(
@@ -74,27 +70,27 @@ class AuditLog:
 
     @property
     def fault(self) -> str | None:
-        """Why nothing is being written, one line with the mend; None: all is well."""
+        """Why nothing can be written, one line with the remedy; None while it can."""
         return self._fault
 
     @property
     def dropped(self) -> int:
-        """Lines that will never be in the log, since the start."""
+        """Lines lost since the start."""
         return self._dropped
 
     @property
     def written(self) -> int:
-        """Lines in the log, headers not counted, since the start."""
+        """Lines written since the start, without headers."""
         return self._written
 
     def start(self) -> None:
-        """Starts the thread; a daemon, so that a disk that hangs cannot hold the process."""
+        """Starts the thread: a daemon, so that a hung disk cannot keep the process alive."""
         if self._path is not None and self._thread is None:
             self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
             self._thread.start()
 
     def write(self, line: EventLine) -> None:
-        """Puts a line aside; drops the oldest one, and counts it, when too many wait."""
+        """Queues a line; drops and counts the oldest one when the queue is full."""
         if self._path is None:
             return
         data = encode_line(line)
@@ -106,7 +102,7 @@ class AuditLog:
             self._changed.notify()
 
     def close(self, timeout_s: float = 2.0) -> bool:
-        """Writes what waits and ends the thread; False when that took longer than `timeout_s`."""
+        """Writes the queue and ends the thread; False if that takes longer than `timeout_s`."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -125,23 +121,22 @@ class AuditLog:
             written, error = self._append(lines, sync=closing)
             with self._changed:
                 self._written += written
-                self._put_back(lines[written:], lost=closing)
-                self._say(error)
+                self._requeue(lines[written:], lost=closing)
+                self._log_fault_change(error)
                 if closing:
                     break
                 if error is not None:
                     self._changed.wait_for(lambda: self._closing, self._retry_s)
         self._close_file()
 
-    def _put_back(self, lines: list[bytes], *, lost: bool) -> None:
-        """Unwritten lines wait again, before younger ones, as far as there is room."""
+    def _requeue(self, lines: list[bytes], *, lost: bool) -> None:
+        """Puts unwritten lines back before newer ones, as far as there is room."""
         room = 0 if lost else max(0, self._queue_size - len(self._queue))
         kept = lines[max(0, len(lines) - room) :] if room else []
         self._dropped += len(lines) - len(kept)
         self._queue.extendleft(reversed(kept))
 
-    def _say(self, error: str | None) -> None:
-        """Tells a change of `fault`, once."""
+    def _log_fault_change(self, error: str | None) -> None:
         if error != self._fault:
             if error is None:
                 log.info("audit: writing again")
@@ -150,19 +145,19 @@ class AuditLog:
         self._fault = error
 
     def _append(self, lines: list[bytes], *, sync: bool) -> tuple[int, str | None]:
-        """Writes `lines`; how many are in the file now, and what stopped the rest."""
+        """Writes `lines`; returns how many were written, and the error that stopped the rest."""
         written = 0
         try:
             for line in lines:
-                file = self._ready(len(line))
-                self._put(file, line)
+                file = self._open_file(len(line))
+                self._write_all(file, line)
                 written += 1
             if self._file is not None and (
                 sync or time.monotonic() - self._synced_s > self._sync_s
             ):
                 os.fsync(self._file.fileno())
                 self._synced_s = time.monotonic()
-        except _TooFullError as exc:
+        except _DiskFullError as exc:
             self._close_file()
             return written, str(exc)
         except OSError as exc:
@@ -172,22 +167,22 @@ class AuditLog:
                 "make room, or set audit.path to a directory that the service may write"
             )
         except Exception as exc:  # noqa: BLE001
-            # A bug must show as a fault: a thread that has died quietly would show as nothing.
+            # A bug must become a fault: a thread that died would not be noticed.
             self._close_file()
             return written, f"{self._path}: the audit log failed ({type(exc).__name__}: {exc})"
         return written, None
 
-    def _ready(self, length: int) -> BinaryIO:
-        """The open file with room for `length` more bytes, rotated where needed."""
+    def _open_file(self, length: int) -> BinaryIO:
+        """The open file, rotated first where `length` more bytes exceed its limit."""
         assert self._path is not None  # noqa: S101  # the thread runs only with a path
-        if self._file is not None and self._moved_away(self._path):
+        if self._file is not None and self._was_replaced(self._path):
             self._close_file()
         if self._file is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._check_room(self._path)
+            self._check_free_space(self._path)
             self._open(self._path)
         else:
-            self._check_room(self._path)
+            self._check_free_space(self._path)
         if self._size + length > self._max_bytes and self._size > len(self._header):
             self._close_file()
             self._rotate(self._path)
@@ -200,11 +195,11 @@ class AuditLog:
         self._file = path.open("ab", buffering=0)
         self._size = os.fstat(self._file.fileno()).st_size
         if self._size and not _ends_with_newline(path):
-            self._put(self._file, b"\n")  # a power cut tore the last line
-        self._put(self._file, self._header)
+            self._write_all(self._file, b"\n")  # a power cut tore the last line
+        self._write_all(self._file, self._header)
 
-    def _put(self, file: BinaryIO, data: bytes) -> None:
-        """Writes all of `data`, or nothing: a line torn by a full disk is taken back."""
+    def _write_all(self, file: BinaryIO, data: bytes) -> None:
+        """Writes all of `data`, or nothing: a partial line is truncated again."""
         done = 0
         try:
             while done < len(data):
@@ -221,16 +216,16 @@ class AuditLog:
             if source.exists():
                 source.replace(_numbered(path, number))
 
-    def _check_room(self, path: Path) -> None:
+    def _check_free_space(self, path: Path) -> None:
         free = self._free_bytes(path.parent)
         if free < self._min_free_bytes:
-            raise _TooFullError(
+            raise _DiskFullError(
                 f"{path}: no audit log while less than audit.min_free_mb "
                 f"({self._min_free_bytes / MB:g} MB) is free: make room on the disk"
             )
 
-    def _moved_away(self, path: Path) -> bool:
-        """Whether someone removed or replaced the file; what is written there would be lost."""
+    def _was_replaced(self, path: Path) -> bool:
+        """Whether the file was removed or replaced: lines written to it would be lost."""
         assert self._file is not None  # noqa: S101  # asked only about an open file
         try:
             return not os.path.samestat(path.stat(), os.fstat(self._file.fileno()))
@@ -243,8 +238,8 @@ class AuditLog:
             file.close()  # unbuffered: nothing is left to fail
 
 
-class _TooFullError(Exception):
-    """Less room than the configuration wants kept."""
+class _DiskFullError(Exception):
+    """Less than `audit.min_free_mb` is free."""
 
 
 def _numbered(path: Path, number: int) -> Path:

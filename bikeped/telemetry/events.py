@@ -1,24 +1,24 @@
-"""Event lines to a file of their own: what `--events` writes."""
+"""The event file that `--events` writes."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 from types import TracebackType
+from typing import TypeVar
 
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.builders import encode_line
 from bikeped.telemetry.schema import EventHeader, EventLine
 
+Writer = TypeVar("Writer", bound="EventWriter")
+
 
 class EventWriter:
-    """Writes the header and then one line a frame; the file appears under its name at `close`.
+    """Writes the header and then one line a frame to `<name>.partial`; `close` renames it.
 
-    Until then, and for ever when the process is interrupted, it is `<name>.partial`: a file under
-    the asked name is always whole. As a context manager it closes after success and leaves the
-    partial file after an exception.
-
-    Raises TelemetryError, naming the file, when it cannot be written.
+    A file of the final name is always complete. As a context manager it closes after success and
+    leaves the partial file after an exception. Raises TelemetryError when it cannot write.
     """
 
     def __init__(self, path: Path | str, header: EventHeader) -> None:
@@ -38,7 +38,7 @@ class EventWriter:
             raise self._error(exc) from exc
 
     def close(self) -> None:
-        """Puts the whole file under its name; again is harmless."""
+        """Completes the file and renames it; again is harmless."""
         if self._file.closed:
             return
         try:
@@ -50,13 +50,13 @@ class EventWriter:
             raise self._error(exc) from exc
 
     def abandon(self) -> None:
-        """Closes the file and leaves it under its partial name, as far as it came."""
+        """Closes the file and leaves it under its partial name."""
         try:
             self._file.close()
         except OSError as exc:
             raise self._error(exc) from exc
 
-    def __enter__(self) -> EventWriter:
+    def __enter__(self: Writer) -> Writer:
         return self
 
     def __exit__(

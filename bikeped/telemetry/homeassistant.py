@@ -1,9 +1,9 @@
-"""What announces the pole to Home Assistant: its MQTT discovery, one retained message an entity.
+"""Home Assistant's MQTT discovery: one retained message an entity. Pure.
 
 Follows https://www.home-assistant.io/integrations/mqtt/#mqtt-discovery: the topic is
 `<prefix>/<component>/<object_id>/config` with an object id equal to the unique id; an `enum` sensor
 lists its options and has neither unit nor state class; `None` means unknown. One message an
-entity, rather than one a device, is understood by old and new versions alike. Pure.
+entity, not one a device: old versions understand only that.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bikeped.telemetry.schema import ShownState
 
 
 def discovery_messages(config: MqttConfig, version: str) -> dict[str, bytes]:
-    """Topic -> payload of every entity; publish them retained.
+    """Topic -> payload of every entity, to be published retained.
 
     An empty retained payload on one of these topics removes its entity again.
     """
@@ -37,81 +37,62 @@ def discovery_messages(config: MqttConfig, version: str) -> dict[str, bytes]:
         "origin": {"name": "bikeped", "sw_version": version},
         "qos": config.qos,
     }
-    # A process that hangs keeps its connection for a while; three missed reports say it earlier.
+    # A process that hangs keeps its connection for a while; three missed reports show it earlier.
     health = {
         "state_topic": f"{base}/health",
         "expire_after": max(30, round(3 * config.health_interval_s)),
         "entity_category": "diagnostic",
     }
-    entities: list[tuple[str, str, dict[str, Any]]] = [
-        (
-            "sensor",
-            "state",
-            {
-                "name": "State",
-                "icon": "mdi:traffic-light",
-                "device_class": "enum",
-                "options": list(get_args(ShownState)),
-                "state_topic": f"{base}/state",
-                "value_template": "{{ value_json.state }}",
-                "json_attributes_topic": f"{base}/state",
-            },
-        ),
-        (
-            "binary_sensor",
-            "problem",
-            {
-                **health,
-                "name": "Problem",
-                "device_class": "problem",
-                "payload_on": "ON",
-                "payload_off": "OFF",
-                "value_template": "{{ 'ON' if value_json.faults else 'OFF' }}",
-                "json_attributes_topic": f"{base}/health",
-                "json_attributes_template": "{{ {'faults': value_json.faults} | tojson }}",
-            },
-        ),
-        (
-            "sensor",
-            "fps",
-            {
-                **health,
-                "name": "Frame rate",
-                "icon": "mdi:speedometer",
-                "unit_of_measurement": "fps",
-                "state_class": "measurement",
-                "value_template": "{{ value_json.fps }}",
-            },
-        ),
-        *(
-            (
-                "sensor",
-                f"latency_{percentile}",
-                {
-                    **health,
-                    "name": f"Latency {percentile}",
-                    "device_class": "duration",
-                    "unit_of_measurement": "ms",
-                    "state_class": "measurement",
-                    "value_template": "{{ value_json.latency_ms.total."
-                    f"{percentile} if 'total' in value_json.latency_ms else none }}}}",
-                },
-            )
-            for percentile in ("p50", "p95")
-        ),
-    ]
+    measurement = {**health, "state_class": "measurement"}
+    entities: dict[tuple[str, str], dict[str, Any]] = {
+        ("sensor", "state"): {
+            "name": "State",
+            "icon": "mdi:traffic-light",
+            "device_class": "enum",
+            "options": list(get_args(ShownState)),
+            "state_topic": f"{base}/state",
+            "value_template": "{{ value_json.state }}",
+            "json_attributes_topic": f"{base}/state",
+        },
+        ("binary_sensor", "problem"): {
+            **health,
+            "name": "Problem",
+            "device_class": "problem",
+            "payload_on": "ON",
+            "payload_off": "OFF",
+            "value_template": "{{ 'ON' if value_json.faults else 'OFF' }}",
+            "json_attributes_topic": f"{base}/health",
+            "json_attributes_template": "{{ {'faults': value_json.faults} | tojson }}",
+        },
+        ("sensor", "fps"): {
+            **measurement,
+            "name": "Frame rate",
+            "icon": "mdi:speedometer",
+            "unit_of_measurement": "fps",
+            "value_template": "{{ value_json.fps }}",
+        },
+    }
+    for percentile in ("p50", "p95"):
+        entities["sensor", f"latency_{percentile}"] = {
+            **measurement,
+            "name": f"Latency {percentile}",
+            "device_class": "duration",
+            "unit_of_measurement": "ms",
+            "value_template": "{{ value_json.latency_ms.total."
+            f"{percentile} if 'total' in value_json.latency_ms else none }}}}",
+        }
     return {
         f"{config.discovery_prefix}/{component}/{pole}_{name}/config": msgspec.json.encode(
             {**entity, "unique_id": f"{pole}_{name}", **shared}
         )
-        for component, name, entity in entities
+        for (component, name), entity in entities.items()
     }
 
 
 def object_id(site: str) -> str:
-    """A name for `site` from the letters that Home Assistant allows: [a-zA-Z0-9_-].
+    """An id for `site` of the characters that Home Assistant allows: [a-zA-Z0-9_-].
 
-    Where letters had to be replaced a digest keeps two sites apart that would look alike.
+    Where some had to be replaced, a digest keeps similar sites apart.
     """
     plain = re.sub(r"[^a-zA-Z0-9_-]", "_", site)
     if plain == site:

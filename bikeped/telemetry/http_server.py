@@ -1,4 +1,4 @@
-"""`/metrics` and `/healthz` over HTTP, and the server that they and the pages share."""
+"""`/metrics` and `/healthz` over HTTP, and the HTTP server that serves them and the pages."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _requests_log = log.getChild("requests")
 
 Health = Callable[[], Mapping[str, Any]]
 
-_WELL = frozenset(get_args(ShownState)) - {"FAULT"}
-#: A connection on which nothing is asked for so long is closed: it takes another's place.
+_HEALTHY = frozenset(get_args(ShownState)) - {"FAULT"}
+#: A connection without a request for this long is closed, to free its place.
 IDLE_S = 20.0
-#: How long the rest of a refused body is thrown away unread, so that the sender gets the answer.
+#: How long the rest of a refused body is read and discarded, so that the sender gets the answer.
 _LINGER_S = 0.5
 #: Turns of asyncio's loop from an accepted socket to its `connection_made`, and one more.
 _TURNS_TO_ACCEPT = 4
@@ -35,13 +35,13 @@ _BACKLOG = 32
 def add_monitoring(app: web.Application, registry: CollectorRegistry, health: Health) -> None:
     """Adds `/metrics` (Prometheus) and `/healthz` to an application.
 
-    `health` returns the health message as a mapping; without a `state` that is known and not FAULT,
-    or when it raises, `/healthz` answers 503.
+    `health` returns the health message as a mapping; `/healthz` answers 503 when its `state` is
+    FAULT, unknown or absent, and when `health` raises.
     """
 
     async def metrics(request: web.Request) -> web.Response:
         encode, content_type = choose_encoder(request.headers.get("Accept", ""))
-        # Rendering takes milliseconds, which the loop that judges frames does not have.
+        # Rendering takes milliseconds: too long for the event loop.
         body = await asyncio.to_thread(encode, registry)
         return web.Response(body=body, headers={"Content-Type": content_type})
 
@@ -53,7 +53,7 @@ def add_monitoring(app: web.Application, registry: CollectorRegistry, health: He
             log.exception("healthz: the health report failed")
             report = {"state": "FAULT", "faults": ["the health report failed: see the log"]}
             body = msgspec.json.encode(report)
-        status = 200 if report.get("state") in _WELL else 503
+        status = 200 if report.get("state") in _HEALTHY else 503
         return web.Response(
             status=status,
             body=body,
@@ -66,9 +66,9 @@ def add_monitoring(app: web.Application, registry: CollectorRegistry, health: He
 
 
 class HttpServer:
-    """Serves an application at `config.host` and `config.port`, to `config.max_connections`.
+    """Serves an application at `config.host` and `config.port`, up to `config.max_connections`.
 
-    A port that cannot be bound is a line in `error`, never the end of the service.
+    A port that cannot be bound is reported in `error`; the service goes on.
     """
 
     def __init__(self, app: web.Application, config: WebConfig) -> None:
@@ -76,16 +76,16 @@ class HttpServer:
         self._config = config
         self._runner: web.AppRunner | None = None
         self._server: asyncio.Server | None = None
-        self.error: str | None = None  #: why it is not serving, one line with the mend
-        self.port: int | None = None  #: the port it serves; None while it does not
+        self.error: str | None = None  #: why it is not serving, one line with the remedy
+        self.port: int | None = None  #: None while it does not serve
 
     async def start(self) -> bool:
-        """Binds and serves; whether that worked. After a failure the application may not be reused:
-        make a new one to try again."""
+        """Binds and serves; returns whether that worked. After a failure, retry with a new
+        application: this one cannot be reused."""
         config = self._config
         runner = web.AppRunner(
             self._app,
-            access_log=None,  # a scrape every few seconds for months is not news
+            access_log=None,  # it would be mostly scrapes
             logger=_requests_log,
             shutdown_timeout=1.0,
             keepalive_timeout=IDLE_S,
@@ -96,17 +96,17 @@ class HttpServer:
         if accept is None:  # pragma: no cover - set by setup()
             raise RuntimeError("the application is not set up")
 
-        def door() -> asyncio.BaseProtocol:
+        def new_connection() -> asyncio.BaseProtocol:
             full = len(accept.connections) >= config.max_connections
-            return _TurnAway() if full else accept()
+            return _RejectConnection() if full else accept()
 
         try:
             self._server = await asyncio.get_running_loop().create_server(
-                door, config.host, config.port, backlog=_BACKLOG
+                new_connection, config.host, config.port, backlog=_BACKLOG
             )
         except OSError as exc:
             await runner.cleanup()
-            self.error = _refusal(config, exc)
+            self.error = _bind_error(config, exc)
             log.error("web: %s", self.error)
             return False
         self._runner = runner
@@ -124,7 +124,7 @@ class HttpServer:
         return f"http://{host}:{self.port}/"
 
     async def stop(self) -> None:
-        """Stops serving; open requests get a second to end. Who takes nothing is cut off."""
+        """Stops serving; open requests get a second to end, then they are cut off."""
         runner, self._runner, self.port = self._runner, None, None
         if self._server is not None:
             self._server.close()
@@ -132,49 +132,48 @@ class HttpServer:
         accepting = None if runner is None else runner.server
         if runner is None or accepting is None:
             return
-        for _ in range(_TURNS_TO_ACCEPT):  # who was being let in when the door closed is in now
+        for _ in range(_TURNS_TO_ACCEPT):  # connections being accepted at close() exist after this
             await asyncio.sleep(0)
         connections = [c.transport for c in accepting.connections if c.transport is not None]
         await runner.cleanup()
         connections += [c.transport for c in accepting.connections if c.transport is not None]
         for connection in connections:
             connection.abort()
-        for _ in range(_TURNS_TO_ACCEPT):  # in which they are let go
+        for _ in range(_TURNS_TO_ACCEPT):  # until their closing is processed
             await asyncio.sleep(0)
 
 
-def _is_news(record: logging.LogRecord) -> bool:
-    """What is no request (a port scan, an address of 9 kB) is answered with status 400. In a
-    journal of months it is no news, and a trace of it would hide what is."""
+def _not_malformed(record: logging.LogRecord) -> bool:
+    """Malformed requests (port scans, a 9 kB address) are answered with 400 and not logged."""
     return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
 
 
-_requests_log.addFilter(_is_news)
+_requests_log.addFilter(_not_malformed)
 
 
 def port_error(config: WebConfig) -> str | None:
-    """Why `HttpServer` could not serve at `config` now, one line with the mend; None if it could.
+    """Why `HttpServer` could not serve at `config` now, one line with the remedy; None if it could.
 
-    For what only serves after long work: somebody else may have taken the port by then.
+    For a check before long work; the port may still be taken by the time of serving.
     """
     try:
         found = socket.getaddrinfo(config.host, config.port, type=socket.SOCK_STREAM)
         for family, _, _, _, place in found:
             socket.create_server(place, family=family).close()
     except OSError as exc:
-        return _refusal(config, exc)
+        return _bind_error(config, exc)
     return None
 
 
-def _refusal(config: WebConfig, error: OSError) -> str:
+def _bind_error(config: WebConfig, error: OSError) -> str:
     return (
         f"cannot serve http://{config.host}:{config.port} "
         f"({error.strerror or error}): set web.host and web.port to a free one of this machine"
     )
 
 
-class _TurnAway(asyncio.Protocol):
-    """One connection too many: one answer and the door."""
+class _RejectConnection(asyncio.Protocol):
+    """Answers a connection above the limit with 503 and closes it."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         if isinstance(transport, asyncio.WriteTransport):
@@ -188,7 +187,7 @@ class _TurnAway(asyncio.Protocol):
 
 
 def host_name(header: str) -> str:
-    """The name in a Host header, in small letters, without port and brackets."""
+    """The host of a Host header, lower-case, without port and brackets."""
     name = header.strip().lower()
     if name.startswith("["):
         return name[1:].partition("]")[0]

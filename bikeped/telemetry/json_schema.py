@@ -1,4 +1,4 @@
-"""JSON Schemas of all messages, from the very types that build them.
+"""JSON Schemas of all messages, from the types in `schema`.
 
 `python -m bikeped.telemetry.json_schema docs/messages` writes one file a message.
 """
@@ -13,18 +13,18 @@ from typing import Any
 import msgspec
 
 from bikeped.errors import TelemetryError
-from bikeped.telemetry import schema as shapes
+from bikeped.telemetry import schema as messages
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 #: file name (before .schema.json) -> type of the payload
 MESSAGES: dict[str, Any] = {
-    "tracks": shapes.TracksMessage,
-    "state": shapes.StateMessage,
-    "health": shapes.HealthMessage,
-    "availability": shapes.Availability,
-    "event-header": shapes.EventHeader,
-    "event-frame": shapes.EventLine,
+    "tracks": messages.TracksMessage,
+    "state": messages.StateMessage,
+    "health": messages.HealthMessage,
+    "availability": messages.Availability,
+    "event-header": messages.EventHeader,
+    "event-frame": messages.EventLine,
 }
 
 
@@ -47,19 +47,17 @@ def write(directory: Path) -> list[Path]:
 
     Raises TelemetryError when the directory cannot be written.
     """
-    written = []
+    paths = {directory / name: text for name, text in schema_files().items()}
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for file_name, text in schema_files().items():
-            path = directory / file_name
+        for path, text in paths.items():
             path.write_text(text, encoding="utf-8")
-            written.append(path)
     except OSError as exc:
         raise TelemetryError(
             f"{exc.filename or directory}: cannot write the schemas ({exc.strerror}): "
             "give a directory that you may write"
         ) from exc
-    return written
+    return list(paths)
 
 
 def main(arguments: list[str]) -> int:

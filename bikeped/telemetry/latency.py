@@ -1,4 +1,4 @@
-"""How long each stage of a frame took: the last frames, and their percentiles."""
+"""Duration of each stage over the last frames, and percentiles."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from bikeped.types import FloatArray
 
-#: The stages by the paper's names, in the order of a frame's way; `total` is the whole of a
-#: frame's processing, `capture_age` the time from capture to the light.
+#: The paper's stages in processing order; `total` is the processing time of a frame, `capture_age`
+#: the time from capture to the light.
 STAGES = (
     "acquire",
     "pre",
@@ -29,7 +29,7 @@ _INDEX = {stage: row for row, stage in enumerate(STAGES)}
 class StageTimes:
     """The durations of the last `capacity` frames of each stage, in milliseconds.
 
-    Recording costs a few stores into a ring; nothing is sorted until someone asks. For one thread.
+    Ring buffers; percentiles are computed on request. For one thread.
     """
 
     def __init__(self, capacity: int = 900) -> None:
@@ -40,10 +40,7 @@ class StageTimes:
         self._count = [0] * len(STAGES)
 
     def add(self, durations_ms: Mapping[str, float]) -> None:
-        """Records one frame. A stage that did not run is left out; NaN counts as not run.
-
-        Raises ValueError for a stage that is not in `STAGES`.
-        """
+        """Records one frame; NaN means not run. ValueError for a stage that is not in `STAGES`."""
         for stage, duration_ms in durations_ms.items():
             row = _INDEX.get(stage)
             if row is None:
@@ -53,19 +50,16 @@ class StageTimes:
                 self._count[row] += 1
 
     def frames(self, stage: str) -> int:
-        """How many durations of `stage` were recorded since the start."""
+        """Number of durations of `stage` recorded since the start."""
         return self._count[_INDEX[stage]]
 
     def values_ms(self, stage: str) -> FloatArray:
-        """The remembered durations of `stage`, in no particular order."""
+        """The durations of `stage` over the last `capacity` frames, in no particular order."""
         row = _INDEX[stage]
         return self._ring[row, : min(self._count[row], self.capacity)].copy()
 
     def percentiles(self) -> dict[str, dict[str, float]]:
-        """p50, p95, p99, max and mean in ms of every stage that ran, over the remembered frames.
-
-        Percentiles are interpolated linearly, numpy's default.
-        """
+        """p50, p95, p99 (linearly interpolated), max and mean in ms of every stage that ran."""
         rows = {}
         for stage in STAGES:
             values = self.values_ms(stage)
@@ -81,7 +75,7 @@ class StageTimes:
         return rows
 
     def table(self) -> str:
-        """The percentiles as aligned text, for the end of a replay; one stage a line."""
+        """The percentiles as aligned text, one stage a line."""
         columns = ("mean", "p50", "p95", "p99", "max")
         lines = [f"{'stage, ms':<12}" + "".join(f"{name:>10}" for name in columns)]
         for stage, row in self.percentiles().items():

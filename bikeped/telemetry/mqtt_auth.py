@@ -1,4 +1,4 @@
-"""Who the publisher is to the broker, and how the connection is encrypted."""
+"""Credentials and TLS of the connection to the broker."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 @dataclass(frozen=True)
 class Credentials:
-    """User name, password and TLS, as the client library takes them; None: without."""
+    """User name, password and TLS context; None: without."""
 
     username: str | None
     password: str | None = field(repr=False)
@@ -24,9 +24,9 @@ class Credentials:
 def load_credentials(config: MqttConfig, base_dir: Path = Path()) -> Credentials:
     """Reads the files that `config` names; relative ones are relative to `base_dir`.
 
-    Raises TelemetryError, naming the file, the key and the mend, when a file cannot be used, or
-    when keys contradict one another: a certificate without `tls` would mean a connection in the
-    clear that its owner believes encrypted.
+    Raises TelemetryError, naming file, key and remedy, when a file cannot be used or keys
+    contradict one another: a certificate without `tls` would mean an unencrypted connection that
+    its owner believes encrypted.
     """
     _check_keys(config)
     password = None
@@ -90,7 +90,7 @@ def _tls(config: MqttConfig, base_dir: Path) -> ssl.SSLContext:
         cert_file = base_dir / config.cert_file
         key_file = None if config.key_file is None else base_dir / config.key_file
         try:
-            # Without this an encrypted key would make OpenSSL ask on a terminal that nobody sees.
+            # An encrypted key would otherwise make OpenSSL prompt on the terminal.
             context.load_cert_chain(cert_file, key_file, password=_no_password)
         except (OSError, ssl.SSLError) as exc:
             files = f"{cert_file}" if key_file is None else f"{cert_file}, {key_file}"

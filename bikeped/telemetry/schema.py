@@ -1,7 +1,7 @@
-"""The shape of every MQTT payload and of event lines; `schemas` publishes them as JSON Schema.
+"""Types of every MQTT payload and event line; `json_schema` publishes them as JSON Schema.
 
-Key names are those that programs outside rely on. Positions are metres in the camera ground frame
-(x forward, y right).
+Other programs rely on the key names. Positions are metres in the camera ground frame (x forward,
+y right).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Count = Annotated[int, Meta(ge=0)]
 
 
 class Position(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an object is."""
+    """Position of an object."""
 
     x: Annotated[float, Meta(description="forward of the camera, metres")]
     y: Annotated[float, Meta(description="right of the camera, metres")]
@@ -41,7 +41,7 @@ class Position(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Velocity(msgspec.Struct, frozen=True, kw_only=True):
-    """How an object moves."""
+    """Velocity of an object."""
 
     x: Annotated[float, Meta(description="metres per second")]
     y: Annotated[float, Meta(description="metres per second")]
