@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bikeped.cli.common import text_table
-from bikeped.lab.calibration.report.results import CalibrationResult
+from bikeped.lab.calibration.report.results import MODEL_COLUMNS, CalibrationResult, model_row
 from bikeped.lab.calibration.solver.lens_model import CornerObservations
 from bikeped.lab.calibration.solver.model_comparison import paper_criterion
 
@@ -90,20 +90,10 @@ def _table(result: CalibrationResult) -> Table:
     how = (
         "each picture from all others" if every_image else f"each of {folds} folds from the others"
     )
+    rows = [model_row(fit) for fit in fits]
     return text_table(
-        ("model", "cross-validated", "RMS per point", "per coordinate", "f", "cx", "cy"),
-        [
-            (
-                fit.name + (" *" if fit is result.chosen else ""),
-                "-" if fit.cross_validated_px is None else f"{fit.cross_validated_px:.4f}",
-                f"{fit.rms_px:.4f}",
-                f"{fit.rms_per_coordinate_px:.4f}",
-                f"{fit.focal_px:.3f} ± {fit.uncertainty['f']:.3f}",
-                f"{fit.cx:.2f} ± {fit.uncertainty['cx']:.2f}",
-                f"{fit.cy:.2f} ± {fit.uncertainty['cy']:.2f}",
-            )
-            for fit in fits
-        ],
+        MODEL_COLUMNS,
+        [(f"{row[0]} *" if row[0] == result.chosen.name else row[0], *row[1:]) for row in rows],
         title=f"error in px; cross-validated: {how}",
         note="* goes into the calibration file" if len(fits) > 1 else "",
     )

@@ -27,17 +27,6 @@ class Thumbnail:
 
 
 @dataclass(frozen=True)
-class CardImage:
-    """A part of an image as JPEG (base64), at its place in the crop, as SVG attributes."""
-
-    x: str
-    y: str
-    width: int
-    height: int
-    jpeg: str
-
-
-@dataclass(frozen=True)
 class Card:
     """One image's figure: SVG attributes in pixels of the crop, and the caption."""
 
@@ -45,7 +34,8 @@ class Card:
     caption: str
     view_box: str
     zoom: float  #: screen pixels per pixel
-    image: CardImage | None
+    jpeg: str  #: the part of the image, base64; empty without an overlap
+    image_xywh: tuple[float, float, int, int]
     arrows: str  #: path from the projected to the observed corners
     dots: str  #: path of the projected corners
 
@@ -64,7 +54,6 @@ def image_cards(
         error = -fit.residuals_px[row][visible]
         low, high = _frame(uv, error * arrow_scale, fit)
         zoom = _WIDTH_PX / (high - low)[0]
-        thumbnail = by_name.get(observations.names[row])
         start = uv - error
         ends = zip(start, start + error * arrow_scale, strict=True)
         theta = np.degrees(fit.angles_rad[row][visible])
@@ -76,7 +65,7 @@ def image_cards(
             f"{observations.pattern.count} corners",
             " ".join(f"{value:.1f}" for value in (*low, *(high - low))),
             zoom,
-            None if thumbnail is None else _image(thumbnail, low, high, zoom),
+            *_image(by_name.get(observations.names[row]), low, high, zoom),
             "".join(f"M{a:.2f} {b:.2f}L{c:.2f} {d:.2f}" for (a, b), (c, d) in ends),
             "".join(f"M{u:.2f} {v:.2f}h0" for u, v in start),
         )
@@ -99,20 +88,22 @@ def _frame(uv: FloatArray, arrows: FloatArray, fit: LensFit) -> tuple[FloatArray
 
 
 def _image(
-    thumbnail: Thumbnail, low: FloatArray, high: FloatArray, zoom: float
-) -> CardImage | None:
-    """The image's part between two positions [2] in the crop; None where they do not overlap."""
+    thumbnail: Thumbnail | None, low: FloatArray, high: FloatArray, zoom: float
+) -> tuple[str, tuple[float, float, int, int]]:
+    """JPEG (base64) and place of the image's part between two positions [2] in the crop."""
+    if thumbnail is None:
+        return "", (0, 0, 0, 0)
     offset = np.asarray(thumbnail.offset_px, dtype=np.float64)
     height, width = thumbnail.grey.shape[:2]
-    first = np.clip(np.floor(low - offset), 0, [width, height]).astype(np.int64)
-    last = np.clip(np.ceil(high - offset), 0, [width, height]).astype(np.int64)
-    size = last - first
-    if (size < 1).any():
-        return None
-    part = thumbnail.grey[first[1] : last[1], first[0] : last[0]]
+    u0, v0 = (int(x) for x in np.clip(np.floor(low - offset), 0, [width, height]))
+    u1, v1 = (int(x) for x in np.clip(np.ceil(high - offset), 0, [width, height]))
+    if u1 <= u0 or v1 <= v0:
+        return "", (0, 0, 0, 0)
     shrink = min(1.0, zoom * 1.5)
+    part = thumbnail.grey[v0:v1, u0:u1]
     shown = cv2.resize(part, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     _, jpeg = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    at = first + offset - 0.5  # a pixel's middle is its position
-    source = base64.b64encode(jpeg.tobytes()).decode("ascii")
-    return CardImage(f"{at[0]:.1f}", f"{at[1]:.1f}", int(size[0]), int(size[1]), source)
+    first_u, first_v = thumbnail.offset_px
+    # A pixel's middle is its position.
+    place = (first_u + u0 - 0.5, first_v + v0 - 0.5, u1 - u0, v1 - v0)
+    return base64.b64encode(jpeg.tobytes()).decode("ascii"), place

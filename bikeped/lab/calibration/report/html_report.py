@@ -17,7 +17,7 @@ from bikeped.lab.calibration.report.figures import (
     coverage_figure,
     profile_figure,
 )
-from bikeped.lab.calibration.report.results import CalibrationResult
+from bikeped.lab.calibration.report.results import MODEL_COLUMNS, CalibrationResult, model_row
 from bikeped.lab.calibration.solver.lens_fit import LensFit
 from bikeped.lab.calibration.solver.model_comparison import paper_criterion
 from bikeped.templates import render
@@ -37,7 +37,8 @@ def report_page(result: CalibrationResult, thumbnails: Sequence[Thumbnail]) -> s
         fit=fit,
         tiles=_tiles(result),
         cautions=result.cautions,
-        models=[_model_row(f) for f in comparison.ranked],
+        model_columns=MODEL_COLUMNS,
+        models=[model_row(f) for f in comparison.ranked],
         recommendation=result.recommendation.reason,
         criterion=paper_criterion(comparison),
         comparison_png=_base64(comparison_figure(comparison, fit.name)) if several else "",
@@ -99,19 +100,6 @@ def _arrow_scale(fit: LensFit) -> float:
     """Arrows of typical residuals are some 3 % of the image's width."""
     wanted = 0.03 * fit.observations.width / max(fit.rms_px, 1e-3)
     return float(max(1.0, round(wanted, -math.floor(math.log10(max(wanted, 1.0))))))
-
-
-def _model_row(fit: LensFit) -> tuple[str, ...]:
-    held = fit.cross_validated_px
-    return (
-        fit.name,
-        "—" if held is None else f"{held:.4f}",
-        f"{fit.rms_px:.4f}",
-        f"{fit.rms_per_coordinate_px:.4f}",
-        f"{fit.focal_px:.3f} ± {fit.uncertainty['f']:.3f}",
-        f"{fit.cx:.3f}",
-        f"{fit.cy:.3f}",
-    )
 
 
 def _parameter_rows(fit: LensFit) -> list[tuple[str, str, str]]:

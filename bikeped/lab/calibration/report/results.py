@@ -103,6 +103,24 @@ def _fit_data(fit: LensFit) -> dict[str, Any]:
     }
 
 
+#: Errors in px; the columns of `model_row`.
+MODEL_COLUMNS = ("model", "cross-validated", "RMS per point", "per coordinate", "f", "cx", "cy")
+
+
+def model_row(fit: LensFit) -> tuple[str, ...]:
+    """One model's line in the tables for people."""
+    held, sigma = fit.cross_validated_px, fit.uncertainty
+    return (
+        fit.name,
+        "—" if held is None else f"{held:.4f}",
+        f"{fit.rms_px:.4f}",
+        f"{fit.rms_per_coordinate_px:.4f}",
+        f"{fit.focal_px:.3f} ± {sigma['f']:.3f}",
+        f"{fit.cx:.2f} ± {sigma['cx']:.2f}",
+        f"{fit.cy:.2f} ± {sigma['cy']:.2f}",
+    )
+
+
 def calibration_cautions(
     prepared: PreparedObservations, fit: LensFit, field: FieldOfView
 ) -> list[str]:

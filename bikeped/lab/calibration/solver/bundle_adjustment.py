@@ -112,42 +112,6 @@ def refit_robust(observations: CornerObservations, fitted: AdjustmentResult) -> 
     return _run_stage(observations, fitted.model, fitted.state, turn_px, "soft-l1")[0]
 
 
-@dataclass(frozen=True)
-class LinearizedFit:
-    """The last stage's equations at a fit, which give the fit without some images in one step.
-
-    With many images a fit moves little when a few are removed, and one undamped Gauss-Newton step
-    from the optimum gets there (to 1 % of the held-out error, tested).
-    """
-
-    fitted: AdjustmentResult
-    jac: Jacobian
-    weighted_px: FloatArray
-    visible: FloatArray
-    prior: ShapePrior | None
-
-    @staticmethod
-    def of(observations: CornerObservations, fitted: AdjustmentResult) -> LinearizedFit:
-        jac, weighted_px = whitened(
-            jacobian(fitted.state, observations.flat, bent=fitted.model.board),
-            fitted.residuals_px,
-            fitted.sigma_px * SOFT_L1_TURN,
-        )
-        prior = ShapePrior.of(observations, fitted.state) if fitted.model.board else None
-        visible = observations.visible.astype(np.float64)
-        return LinearizedFit(fitted, jac, weighted_px, visible, prior)
-
-    def without(self, out: BoolArray) -> CalibrationState:
-        """Lens and shape fitted to the images that are not `out` [V], and these images' poses."""
-        keep, state = ~out, self.fitted.state
-        jac = Jacobian(*(part[keep] for part in self.jac.parts))
-        basis = None if self.prior is None else self.prior.basis
-        normal = normal_equations(jac, self.weighted_px[keep], self.visible[keep], basis)
-        if self.prior is not None:
-            normal = self.prior.added(normal, state)
-        return apply_step(state.rows(keep), normal.step(0.0), basis)
-
-
 def _run_stage(
     observations: CornerObservations,
     model: LensModel,

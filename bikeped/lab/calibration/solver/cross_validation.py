@@ -6,27 +6,69 @@ held-out fold only the poses are fitted, and its residuals count. This reveals o
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bikeped.lab.calibration.solver.bundle_adjustment import (
+    SOFT_L1_TURN,
     AdjustmentResult,
-    LinearizedFit,
+    ShapePrior,
     refit_robust,
+    whitened,
 )
-from bikeped.lab.calibration.solver.jacobian import jacobian
+from bikeped.lab.calibration.solver.jacobian import Jacobian, jacobian
 from bikeped.lab.calibration.solver.lens_model import (
     CalibrationState,
     CornerObservations,
     residuals,
     rotations,
 )
-from bikeped.lab.calibration.solver.normal_equations import single_threaded
-from bikeped.types import FloatArray, IntArray
+from bikeped.lab.calibration.solver.normal_equations import (
+    apply_step,
+    normal_equations,
+    single_threaded,
+)
+from bikeped.types import BoolArray, FloatArray, IntArray
 
 #: Fewer images than this are refitted for every fold; with more, one linear step is as good.
 _REFIT_BELOW = 10
+
+
+@dataclass(frozen=True)
+class LinearizedFit:
+    """The last stage's equations at a fit, which give the fit without some images in one step.
+
+    With many images a fit moves little when a few are removed, and one undamped Gauss-Newton step
+    from the optimum gets there (to 1 % of the held-out error, tested).
+    """
+
+    fitted: AdjustmentResult
+    jac: Jacobian
+    weighted_px: FloatArray
+    visible: FloatArray
+    prior: ShapePrior | None
+
+    @staticmethod
+    def of(observations: CornerObservations, fitted: AdjustmentResult) -> LinearizedFit:
+        jac, weighted_px = whitened(
+            jacobian(fitted.state, observations.flat, bent=fitted.model.board),
+            fitted.residuals_px,
+            fitted.sigma_px * SOFT_L1_TURN,
+        )
+        prior = ShapePrior.of(observations, fitted.state) if fitted.model.board else None
+        visible = observations.visible.astype(np.float64)
+        return LinearizedFit(fitted, jac, weighted_px, visible, prior)
+
+    def without(self, out: BoolArray) -> CalibrationState:
+        """Lens and shape fitted to the images that are not `out` [V], and these images' poses."""
+        keep, state = ~out, self.fitted.state
+        jac = Jacobian(*(part[keep] for part in self.jac.parts))
+        basis = None if self.prior is None else self.prior.basis
+        normal = normal_equations(jac, self.weighted_px[keep], self.visible[keep], basis)
+        if self.prior is not None:
+            normal = self.prior.added(normal, state)
+        return apply_step(state.rows(keep), normal.step(0.0), basis)
 
 
 def assign_folds(images: int, folds: int) -> IntArray:
