@@ -14,39 +14,16 @@ from bikeped.errors import BikepedError
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-#: Parameters that name an input, or an output, and what the command line calls them.
-_INPUTS = {
-    "video": "VIDEO",
-    "scenario": "SCENARIO",
-    "config_path": "-c",
-    "candidate": "CANDIDATE",
-    "scenarios_dir": "--scenarios",
-    "added": "--scenario",
-    "trace": "--trace",
-    "curve_path": "--recall-curve",
-    "data": "DATA",
-    "images": "IMAGES",
-    "models": "MODEL",
-    "weights": "WEIGHTS",
-    "int8": "--int8",
-    "validation": "--validation",
-    "challenge": "FILE_OR_LINK",
-    "picture": "FRAME",
-    "points_path": "--points",
-}
-_OUTPUTS = {
-    "json_path": "--json",
-    "overlay": "--overlay",
-    "events": "--events",
-    "audit_path": "--audit",
-    "out": "--out",
-    "figure": "--figure",
-    "curve_out": "--curve",
-    "engine": "--engine",
-    "report_path": "--report",
-    "board_path": "--board",
-    "grid_path": "--grid",
-}
+#: Names of the parameters of all commands that are read, and of those that are written.
+_INPUTS = (
+    *("video", "scenario", "config_path", "candidate", "scenarios_dir", "added", "trace"),
+    *("curve_path", "data", "images", "models", "weights", "int8", "validation", "challenge"),
+    *("picture", "points_path"),
+)
+_OUTPUTS = (
+    *("json_path", "overlay", "events", "audit_path", "out", "figure", "curve_out", "engine"),
+    *("report_path", "board_path", "grid_path"),
+)
 
 
 def guarded(command: F) -> F:
@@ -58,14 +35,17 @@ def guarded(command: F) -> F:
 
     @functools.wraps(command)
     def checked(**given: Any) -> Any:
+        parameters = {p.name: p for p in click.get_current_context().command.params}
+        inputs = [(k, path) for k in _INPUTS for path in _read_paths(given.get(k))]
+        outputs = [
+            (k, path)
+            for k in _OUTPUTS
+            for path in written_paths(given.get(k))
+            if not _is_folder(parameters[k], given)
+        ]
         check_outputs(
-            [(_INPUTS[k], p) for k in _INPUTS if k in given for p in _read_paths(given[k])],
-            [
-                (_shown(k), path)
-                for k in _OUTPUTS
-                if k in given and not _is_folder(k, given)
-                for path in written_paths(given[k])
-            ],
+            [(_label(parameters[k]), path) for k, path in inputs],
+            [(_label(parameters[k]), path) for k, path in outputs],
         )
         return command(**given)
 
@@ -101,27 +81,19 @@ def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[st
             )
 
 
-def _parameter(name: str) -> click.Parameter | None:
-    context = click.get_current_context(silent=True)
-    found = context.command.params if context is not None else []
-    return next((p for p in found if p.name == name), None)
-
-
-def _shown(name: str) -> str:
-    """How the command line names an output: its option, or the argument's own word."""
-    parameter = _parameter(name)
+def _label(parameter: click.Parameter) -> str:
+    """What the command line calls a parameter: its option, or the argument's own word."""
     if isinstance(parameter, click.Argument):
-        return str(parameter.metavar or name.upper())
-    return _OUTPUTS[name]
+        return str(parameter.metavar or parameter.name).removesuffix("...").upper()
+    return parameter.opts[0]
 
 
-def _is_folder(name: str, given: Mapping[str, Any]) -> bool:
-    """Whether an output is a folder: what goes into it has names of its own."""
-    parameter = _parameter(name)
-    kind = parameter.type if parameter is not None else None
-    if isinstance(kind, click.Path) and not kind.file_okay:
+def _is_folder(parameter: click.Parameter, given: Mapping[str, Any]) -> bool:
+    """Whether an output is a folder: the files in it have names of their own."""
+    if isinstance(parameter.type, click.Path) and not parameter.type.file_okay:
         return True
-    return name == "out" and given.get("dataset") is not None  # `scene --dataset N --out FOLDER`
+    # `scene --dataset N --out FOLDER`
+    return parameter.name == "out" and given.get("dataset") is not None
 
 
 def written_paths(value: Any) -> list[Path]:

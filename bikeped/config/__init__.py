@@ -7,7 +7,7 @@ from bikeped.config.build import (
     rule_settings,
     tracker_settings,
 )
-from bikeped.config.calibration_file import Calibration, load_calibration
+from bikeped.config.calibration_file import load_calibration
 from bikeped.config.load import (
     LoadedConfig,
     config_hash,
@@ -17,8 +17,8 @@ from bikeped.config.load import (
     parse_config,
     parse_decision,
 )
-from bikeped.config.schema.decision import DecisionConfig, LatencyConfig, TrackingConfig
-from bikeped.config.schema.inputs import CameraConfig, Config, DetectionConfig
+from bikeped.config.schema.decision import DecisionConfig
+from bikeped.config.schema.inputs import CameraConfig, Config
 from bikeped.config.schema.outputs import (
     AuditConfig,
     FeedbackConfig,
@@ -33,18 +33,14 @@ from bikeped.config.validate import known_keys
 
 __all__ = [
     "AuditConfig",
-    "Calibration",
     "CameraConfig",
     "Config",
     "DecisionConfig",
-    "DetectionConfig",
     "FeedbackConfig",
     "GpioConfig",
-    "LatencyConfig",
     "LoadedConfig",
     "MqttConfig",
     "SoundConfig",
-    "TrackingConfig",
     "UsbConfig",
     "WebConfig",
     "config_hash",

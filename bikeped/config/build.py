@@ -1,4 +1,4 @@
-"""From configuration sections to the settings of the pure core.
+"""From configuration sections to the settings of geometry, tracking and decision.
 
 Settings in nominal frames become seconds here, once.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from bikeped.config.calibration_file import Calibration
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema.decision import DecisionConfig, TrackingConfig
 from bikeped.decision import RuleSettings
@@ -72,7 +73,7 @@ def tracker_settings(
 
 
 def framing(loaded: LoadedConfig) -> Framing:
-    """How the sensor image lies in the crop; ConfigError when it cannot."""
+    """How the sensor image lies in the crop; ConfigError when the sizes do not fit."""
     camera = loaded.config.camera
     try:
         return Framing(camera.width, camera.height, camera.pad_size, camera.crop_size)
@@ -83,36 +84,32 @@ def framing(loaded: LoadedConfig) -> Framing:
 def ground_camera(loaded: LoadedConfig) -> GroundCamera:
     """The camera above the ground: calibration, overridden by the keys of the camera section.
 
-    `radius_px` (with `fov_deg`) gives the focal length when it is set, as the installer measures
-    it; else the calibration's focal length holds.
+    `radius_px` with `fov_deg` gives the focal length where it is set, as an installer measures it;
+    else the calibration does. Raises ConfigError when they describe no camera.
     """
-    camera, calibration = loaded.config.camera, loaded.calibration
-    frame = framing(loaded)
+    camera, frame = loaded.config.camera, framing(loaded)
     width, height = frame.crop_wh
+    # Without a calibration radius_px and fov_deg are set: `validate.check_together`.
+    measured = loaded.calibration or Calibration(
+        model="equidistant", cx=(width - 1) / 2, cy=(height - 1) / 2, focal_length=0, fov_deg=0
+    )
+
+    def chosen(key: str) -> float:
+        value = getattr(camera, key)
+        return float(getattr(measured, key) if value is None else value)
+
+    k = (chosen("k1"), chosen("k2"), chosen("k3"), chosen("k4"))
+    fov_deg = chosen("fov_deg")
     try:
-        if calibration is None:
-            name = canonical_projection(camera.projection or "equidistant")
-            measured_k: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-            cx, cy = (width - 1) / 2, (height - 1) / 2
-        else:
-            name = canonical_projection(camera.projection or calibration.model)
-            measured_k = (calibration.k1, calibration.k2, calibration.k3, calibration.k4)
-            cx, cy = calibration.cx, calibration.cy
-        set_k = (camera.k1, camera.k2, camera.k3, camera.k4)
-        k1, k2, k3, k4 = (m if s is None else s for m, s in zip(measured_k, set_k, strict=True))
-        fov = camera.fov_deg or (calibration.fov_deg if calibration else None)
-        if fov is None:
-            raise GeometryError("camera.fov_deg: missing; set the field of view in degrees")
+        name = canonical_projection(camera.projection or measured.model)
         if camera.radius_px is not None:
-            lens = Lens.from_circle(name, camera.radius_px, fov, (k1, k2, k3, k4))
-        elif calibration is not None:
-            lens = Lens(name, calibration.focal_length, math.radians(fov) / 2, (k1, k2, k3, k4))
+            lens = Lens.from_circle(name, camera.radius_px, fov_deg, k)
         else:
-            raise GeometryError("camera.radius_px: missing; set the image circle's radius")
+            lens = Lens(name, measured.focal_length, math.radians(fov_deg) / 2, k)
         return GroundCamera(
             lens=lens,
-            cx=cx if camera.cx is None else camera.cx,
-            cy=cy if camera.cy is None else camera.cy,
+            cx=chosen("cx"),
+            cy=chosen("cy"),
             height_m=camera.height_m,
             pitch_deg=camera.pitch_deg,
             heading_deg=camera.heading_deg,
