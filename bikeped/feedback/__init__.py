@@ -7,7 +7,6 @@ and `SimulatedLight` are devices; `speaker` plays the sounds of `sounds`.
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bikeped.feedback.gpio import GpioLight, gpio_lamps
@@ -32,7 +31,6 @@ __all__ = [
     "fault_signal",
     "light_driver",
     "open_light",
-    "open_speaker",
 ]
 
 
@@ -67,8 +65,3 @@ def light_driver(config: FeedbackConfig) -> LightDriver:
     """
     check_light(config)
     return LightDriver(partial(open_light, config), fault_blink_hz=config.fault_blink_hz)
-
-
-def open_speaker(config: FeedbackConfig, base: Path | None = None) -> Speaker:
-    """The configured speaker; relative WAV paths start from `base`, the configuration's folder."""
-    return Speaker(config.sound, base=base)

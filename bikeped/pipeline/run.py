@@ -16,7 +16,7 @@ from bikeped.capture import FrameGrabber, FrameSource, PacedSource
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
-from bikeped.feedback import LightDriver, fault_signal, light_driver, open_speaker
+from bikeped.feedback import LightDriver, Speaker, fault_signal, light_driver
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import Application, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector
@@ -105,7 +105,7 @@ async def _serve(
 ) -> int:
     """Starts every part and runs until `stop`; `stack` unwinds before `last`."""
     config, camera = loaded.config, loaded.config.camera
-    speaker = open_speaker(config.feedback, loaded.base_dir)
+    speaker = Speaker(config.feedback.sound, base=loaded.base_dir)
     stack.push_async_callback(speaker.close)
     audit = None
     if config.audit.path is not None:
