@@ -1,6 +1,7 @@
 // The plan view: the camera low in the middle, forward up, rings every 5 m. Between two messages the
 // marks move on with their speed, and what a message corrects is taken up within a tenth of a second.
 
+import { chip, circle, line, polygon, shape, text } from "/static/canvas.js";
 import { calm, canvasOf, colour, metres } from "/static/ui.js";
 
 const BEHIND = 0.2;      // share of the range that is shown behind the camera
@@ -85,8 +86,10 @@ export class Radar {
     const scale = Math.min((width - 2 * margin) / (2 * this.range), (height - 2 * margin) / (this.range * (1 + BEHIND)));
     const u0 = width / 2;
     const v0 = (height - scale * this.range * (1 + BEHIND)) / 2 + scale * this.range;
-    const px = (x, y) => [u0 + scale * y, v0 - scale * x];
-    this.drawGround(context, width, height, px, scale);
+    const px = ([x, y]) => [u0 + scale * y, v0 - scale * x];
+    context.font = `600 12px ${colour("--sans")}`;
+    context.textBaseline = "middle";
+    this.drawGround(context, width, px, scale);
     const at = performance.now() / 1000;
     const places = new Map([...this.marks].map(([id, mark]) => [id, this.place(mark, at)]));
     for (const mark of this.marks.values()) this.drawTrail(context, mark, px);
@@ -95,156 +98,85 @@ export class Radar {
     for (const [id, mark] of this.marks) this.drawMark(context, mark, places.get(id), px, width, height);
   }
 
-  drawGround(context, width, height, px, scale) {
-    const [u0, v0] = px(0, 0);
+  // The field of view with bearings every 30 degrees and range rings, and the camera.
+  drawGround(context, width, px, scale) {
+    const [u0, v0] = px([0, 0]);
     const r = scale * this.range;
-    const floor = v0 + r * BEHIND + 4;
     context.save();
     context.beginPath();
-    context.rect(0, 0, width, floor);
+    context.rect(0, 0, width, v0 + r * BEHIND + 4);
     context.clip();
-    const from = -Math.PI / 2 + this.heading - Math.min(this.fov, 2 * Math.PI) / 2;
-    const to = from + Math.min(this.fov, 2 * Math.PI);
-    context.fillStyle = colour("--sunk");
-    context.beginPath();
-    context.moveTo(u0, v0);
-    context.arc(u0, v0, r, from, to);
-    context.closePath();
-    context.fill();
-    context.strokeStyle = colour("--line");
-    context.lineWidth = 1;
+    const fov = Math.min(this.fov, 2 * Math.PI);
+    const from = -Math.PI / 2 + this.heading - fov / 2;
+    shape(context, () => {
+      context.moveTo(u0, v0);
+      context.arc(u0, v0, r, from, from + fov);
+    }, { fill: colour("--sunk") });
     for (let degrees = -90; degrees <= 90; degrees += 30) {
       const a = degrees * Math.PI / 180;
-      context.beginPath();
-      context.moveTo(u0, v0);
-      context.lineTo(u0 + r * Math.sin(a), v0 - r * Math.cos(a));
-      context.stroke();
+      line(context, [[u0, v0], [u0 + r * Math.sin(a), v0 - r * Math.cos(a)]], { stroke: colour("--line") });
     }
     const step = this.range > 15 ? 5 : 2;
-    for (let ring = step; ring <= this.range + 1e-6; ring += step) {
-      context.strokeStyle = colour(ring % 10 === 0 ? "--line-strong" : "--line");
-      context.beginPath();
-      context.arc(u0, v0, scale * ring, 0, 2 * Math.PI);
-      context.stroke();
+    const rings = Array.from({ length: Math.floor((this.range + 1e-6) / step) }, (_, i) => (i + 1) * step);
+    for (const ring of rings) {
+      circle(context, [u0, v0], scale * ring, { stroke: colour(ring % 10 === 0 ? "--line-strong" : "--line") });
     }
     context.restore();
-    context.font = `12px ${getComputedStyle(document.body).fontFamily}`;
-    context.textAlign = "center";
-    context.textBaseline = "middle";
-    for (let ring = step; ring <= this.range + 1e-6; ring += step) {
-      const a = 15 * Math.PI / 180;
-      const [u, v] = px(ring * Math.cos(a), ring * Math.sin(a));
-      const word = `${ring} m`;
-      const wide = context.measureText(word).width + 6;
-      context.fillStyle = colour("--sunk");
-      context.fillRect(u - wide / 2, v - 8, wide, 16);
-      context.fillStyle = colour("--soft");
-      context.fillText(word, u, v);
-    }
-    context.fillStyle = colour("--ink");
     context.save();
+    context.font = `12px ${colour("--sans")}`;
+    const label = 15 * Math.PI / 180; // the bearing of the rings' labels
+    for (const ring of rings) {
+      const spot = px([ring * Math.cos(label), ring * Math.sin(label)]);
+      chip(context, `${ring} m`, spot, { fill: colour("--sunk"), ink: colour("--soft"), height: 16, radius: 0 });
+    }
     context.translate(u0, v0);
     context.rotate(this.heading);
-    context.beginPath();
-    context.moveTo(-7, 8);
-    context.lineTo(7, 8);
-    context.lineTo(4, -5);
-    context.lineTo(-4, -5);
-    context.closePath();
-    context.fill();
+    polygon(context, [[-7, 8], [7, 8], [4, -5], [-4, -5]], { fill: colour("--ink") });
     context.restore();
   }
 
-  drawTrail(context, mark, px) {
-    if (mark.trail.length < 2) return;
-    context.strokeStyle = colour(`--${mark.kind}`);
-    context.lineWidth = 2;
-    const n = mark.trail.length;
-    for (let i = 1; i < n; i++) {
-      context.globalAlpha = 0.08 + 0.42 * i / n;
-      context.beginPath();
-      context.moveTo(...px(...mark.trail[i - 1]));
-      context.lineTo(...px(...mark.trail[i]));
-      context.stroke();
+  drawTrail(context, { trail, kind }, px) {
+    for (let i = 1; i < trail.length; i++) {
+      const ends = [px(trail[i - 1]), px(trail[i])];
+      line(context, ends, { stroke: colour(`--${kind}`), width: 2, alpha: 0.08 + 0.42 * i / trail.length });
     }
-    context.globalAlpha = 1;
   }
 
   drawPair(context, places, px) {
     const ends = this.pair && [places.get(this.pair.cyclist), places.get(this.pair.pedestrian)];
     if (!ends || !ends[0] || !ends[1]) return;
-    const [a, b] = ends.map((end) => px(...end));
+    const [a, b] = ends.map(px);
     const tone = this.alerting ? "alert" : "warning";
-    context.strokeStyle = colour(`--${tone}`);
-    context.lineWidth = this.alerting ? 4 : 2.5;
-    context.setLineDash(this.alerting ? [] : [7, 5]);
-    context.beginPath();
-    context.moveTo(...a);
-    context.lineTo(...b);
-    context.stroke();
-    context.setLineDash([]);
-    const word = metres(this.pair.distance_m);
-    context.font = `600 13px ${getComputedStyle(document.body).fontFamily}`;
-    const wide = context.measureText(word).width + 12;
-    if (Math.hypot(b[0] - a[0], b[1] - a[1]) < wide + 40) return;
-    const [u, v] = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
-    context.fillStyle = colour(`--${tone}`);
-    context.beginPath();
-    context.roundRect(u - wide / 2, v - 11, wide, 22, 3);
-    context.fill();
-    context.fillStyle = colour(`--on-${tone}`);
-    context.textAlign = "center";
-    context.textBaseline = "middle";
-    context.fillText(word, u, v + 0.5);
+    const fill = colour(`--${tone}`);
+    line(context, [a, b], { stroke: fill, width: this.alerting ? 4 : 2.5, dash: this.alerting ? [] : [7, 5] });
+    const distance = metres(this.pair.distance_m);
+    if (Math.hypot(b[0] - a[0], b[1] - a[1]) < context.measureText(distance).width + 52) return;
+    const middle = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
+    chip(context, distance, middle, { fill, ink: colour(`--on-${tone}`), height: 22, radius: 3 });
   }
 
-  // Where it will be in a second.
+  // An arrow to the position in one second.
   drawArrow(context, mark, [x, y], px) {
     if (Math.hypot(mark.vx, mark.vy) < 0.3 || Math.hypot(x, y) > this.range) return;
-    context.strokeStyle = colour(`--${mark.kind}`);
-    context.lineWidth = 2;
-    context.beginPath();
-    context.moveTo(...px(x, y));
-    context.lineTo(...px(x + mark.vx, y + mark.vy));
-    context.stroke();
+    line(context, [px([x, y]), px([x + mark.vx, y + mark.vy])], { stroke: colour(`--${mark.kind}`), width: 2 });
   }
 
+  // A road user; beyond the range at its edge, while it is not detected in outline.
   drawMark(context, mark, [x, y], px, width, height) {
     const far = Math.hypot(x, y) > this.range;
     const k = far ? this.range / Math.hypot(x, y) : 1;
-    const [u, v] = px(x * k, y * k);
+    const [u, v] = px([x * k, y * k]);
     if (v > height - 6) return;
-    const ink = colour(`--${mark.kind}`);
-    const fast = Math.hypot(mark.vx, mark.vy);
-    const angle = fast > 0.3 ? Math.atan2(mark.vy, mark.vx) : 0;
+    const ink = colour(`--${mark.kind}`), panel = colour("--panel");
+    const [fill, stroke] = mark.unseen_s > 0 ? [panel, ink] : [ink, panel];
+    const style = { fill, stroke, width: 2, alpha: far ? 0.6 : 1 };
     context.save();
     context.translate(u, v);
-    context.rotate(angle);
-    context.fillStyle = mark.unseen_s > 0 ? colour("--panel") : ink;
-    context.strokeStyle = mark.unseen_s > 0 ? ink : colour("--panel");
-    context.lineWidth = 2;
-    context.globalAlpha = far ? 0.6 : 1;
-    context.beginPath();
-    if (mark.kind === "pedestrian") context.arc(0, 0, 7, 0, 2 * Math.PI);
-    else if (mark.kind === "cyclist") {
-      context.moveTo(0, -11);
-      context.lineTo(8, 8);
-      context.lineTo(0, 4);
-      context.lineTo(-8, 8);
-      context.closePath();
-    } else context.rect(-7, -7, 14, 14);
-    context.fill();
-    context.stroke();
+    if (Math.hypot(mark.vx, mark.vy) > 0.3) context.rotate(Math.atan2(mark.vy, mark.vx));
+    if (mark.kind === "pedestrian") circle(context, [0, 0], 7, style);
+    else if (mark.kind === "cyclist") polygon(context, [[0, -11], [8, 8], [0, 4], [-8, 8]], style);
+    else shape(context, () => context.rect(-7, -7, 14, 14), style);
     context.restore();
-    if (far) return;
-    context.font = `600 12px ${getComputedStyle(document.body).fontFamily}`;
-    context.textAlign = "left";
-    context.textBaseline = "middle";
-    context.lineWidth = 3;
-    context.strokeStyle = colour("--sunk");
-    context.fillStyle = ink;
-    const spot = [Math.min(u + 11, width - 20), v - 11];
-    context.strokeText(String(mark.id), ...spot);
-    context.fillText(String(mark.id), ...spot);
+    if (!far) text(context, String(mark.id), [Math.min(u + 11, width - 20), v - 11], { fill: ink, halo: colour("--sunk") });
   }
 }

@@ -1,5 +1,6 @@
 // Two lines over the last minutes: the median, and what 95 of 100 frames stay below.
 
+import { line } from "/static/canvas.js";
 import { canvasOf, colour } from "/static/ui.js";
 
 const SPAN_S = 120;
@@ -18,33 +19,16 @@ export class Sparkline {
 
   draw(context, width, height) {
     const points = this.points.filter(([, p50]) => p50 !== null);
-    context.strokeStyle = colour("--line");
-    context.lineWidth = 1;
-    context.beginPath();
-    context.moveTo(0, height - 0.5);
-    context.lineTo(width, height - 0.5);
-    context.stroke();
+    line(context, [[0, height - 0.5], [width, height - 0.5]], { stroke: colour("--line") });
     if (points.length < 2) return;
     const end = points[points.length - 1][0];
     const top = Math.max(...points.map(([, , p95]) => p95), 1e-3) * 1.12;
-    const line = (column, dash, tone, thick) => {
-      context.strokeStyle = colour(tone);
-      context.lineWidth = thick;
-      context.setLineDash(dash);
-      context.beginPath();
-      let before = null;
-      for (const point of points) {
-        const u = width - (end - point[0]) / SPAN_S * width;
-        const v = height - 2 - point[column] / top * (height - 4);
-        // A pause is a gap, not a slope.
-        if (before === null || point[0] - before > 3) context.moveTo(u, v);
-        else context.lineTo(u, v);
-        before = point[0];
-      }
-      context.stroke();
-      context.setLineDash([]);
-    };
-    line(2, [2, 2], "--line-strong", 1.5);
-    line(1, [], "--accent", 1.8);
+    const curve = (column, style) => line(context, points.flatMap((point, i) => {
+      const at = [width - (end - point[0]) / SPAN_S * width, height - 2 - point[column] / top * (height - 4)];
+      // A pause is a gap, not a slope.
+      return i && point[0] - points[i - 1][0] > 3 ? [null, at] : [at];
+    }), style);
+    curve(2, { stroke: colour("--line-strong"), width: 1.5, dash: [2, 2] });
+    curve(1, { stroke: colour("--accent"), width: 1.8 });
   }
 }
