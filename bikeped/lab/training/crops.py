@@ -1,9 +1,7 @@
-"""Pieces of pictures to learn from: cut, turned to another scale, another light, partly covered.
+"""Training crops: windows cut from pictures, with random scale, light and occlusion.
 
-A picture is first brought to the size at which the network will see it, by the very letterbox of
-`bikeped.detection`. Then windows of the training size are cut from it: most of them around an
-object, the others anywhere. Everything follows from the seed and the step's number, whatever thread
-does the work.
+A picture is first resized as for the network's input, by the letterbox of `bikeped.detection`. Then
+windows are cut from it, most of them around an object. All depends on the seed and the step only.
 """
 
 from __future__ import annotations
@@ -27,33 +25,32 @@ from bikeped.lab.training.coco import (
 )
 from bikeped.types import FloatArray, ImageArray, IntArray
 
-_LEAST_SHARE = 0.35  #: of an object's area within the window, or it is ignored
-_LEAST_SIDE_PX = 4.0  #: smaller objects cannot be asked for
-_WHOLE = 0.97  #: of an object that shows, or it is hidden in part
+_LEAST_SHARE = 0.35  #: of an object's area within the window; with less it is ignored
+_LEAST_SIDE_PX = 4.0  #: smaller objects are ignored
+_WHOLE = 0.97  #: visible share of an object; with less it is occluded
 _OCCLUDED_WEIGHT = 4
-LARGEST_WINDOW_PX = 256  #: of those whose size is asked for one by one
+LARGEST_WINDOW_PX = 256  #: of windows of any size
 _NOISES, _NOISIEST = 16, 6.0  #: patterns, standard deviation of the strongest in grey levels
 
 
 @dataclass(frozen=True)
 class CropSettings:
-    """How windows are cut and changed; every range is drawn from evenly."""
+    """How windows are cut and changed; ranges are sampled uniformly."""
 
     view: tuple[int, int] = (1280, 736)  #: width and height of the network's input, pixels
     window: tuple[int, int] = (480, 288)
     around_object: float = 0.65  #: share of windows that are cut around an object
-    around_usual: float = 0.2  #: share cut where some other picture has an object
-    #: Share cut around a mistake, of the windows of pictures where a network made one.
-    around_mistaken: float = 0.5
+    around_usual: float = 0.2  #: share cut where another picture has an object
+    around_mistaken: float = 0.5  #: share cut around a false positive, in pictures that have one
     scale: tuple[float, float] = (0.72, 1.1)
     flip: float = 0.5
-    cover: float = 0.15  #: share of windows with something in front of an object
+    cover: float = 0.15  #: share of windows with an occluded object
     light: float = 0.7  #: share of windows whose light and colours are changed
 
 
 @dataclass(frozen=True)
 class Crop:
-    """One window: `rgb` [h, w, 3], objects in its pixels, and boxes that are not to be judged."""
+    """One window: `rgb` [h, w, 3], objects in its pixels, and boxes that are ignored."""
 
     rgb: ImageArray
     box_px: FloatArray
@@ -63,24 +60,23 @@ class Crop:
 
 @dataclass(frozen=True)
 class Sample:
-    """A whole picture at the network's size, letterboxed: `rgb` [h, w, 3] and what is in it."""
+    """A whole picture, letterboxed to the network's size: `rgb` [h, w, 3] and its labels."""
 
     rgb: ImageArray
     box_px: FloatArray
     class_id: IntArray
-    crowd: IntArray  #: 1 where a box stands for many
-    #: What stands there and is nobody, where the data tell: kind of thing -> boxes [n, 4].
+    crowd: IntArray  #: 1 where a box is a region of many objects
+    #: Fixtures, shadows and false positives, by what they are: boxes [n, 4].
     furniture_px: Mapping[str, FloatArray] = field(default_factory=dict)
-    #: Numbers of the objects that the data call hidden in part, or cut by the picture's edge.
-    hidden: frozenset[int] = frozenset()
+    hidden: frozenset[int] = frozenset()  #: indices of occluded or cut objects
 
     @property
     def false_positive_px(self) -> FloatArray:
-        """Boxes [n, 4] of what a network took for somebody and is nobody."""
+        """Boxes [n, 4] of a network's false positives."""
         return self.furniture_px.get(FALSE_POSITIVE, np.zeros((0, 4)))
 
     def sampling_weight(self, index: int) -> int:
-        """How often an object is drawn lots for: who is hidden in part is rarer, and harder."""
+        """Relative frequency of an object: occluded ones are rarer, and harder."""
         return _OCCLUDED_WEIGHT if index in self.hidden else 1
 
 
@@ -90,7 +86,7 @@ def class_ids(data: CocoData) -> dict[int, int]:
 
 
 def read_sample(data: CocoData, image: CocoImage, size: tuple[int, int]) -> Sample:
-    """A picture as a network of input `size` (width, height) sees it; DataSetError as `coco`'s."""
+    """A picture for a network of input `size` (width, height); DataSetError as `read_picture`."""
     fit = Letterbox.fit(image.width, image.height, size, "ultralytics")
     rgb = np.full((size[1], size[0], 3), PAD, np.uint8)
     rgb[fit.top : fit.top + fit.height, fit.left : fit.left + fit.width] = cv2.resize(
@@ -110,7 +106,7 @@ def read_sample(data: CocoData, image: CocoImage, size: tuple[int, int]) -> Samp
 
 
 def _furniture(image: CocoImage, fit: Letterbox) -> dict[str, FloatArray]:
-    """The boxes of every kind of thing in sample pixels."""
+    """Boxes in sample pixels by kind."""
     found: dict[str, list[Box]] = {}
     for what, box in furniture(image):
         found.setdefault(what, []).append(box)
@@ -118,7 +114,7 @@ def _furniture(image: CocoImage, fit: Letterbox) -> dict[str, FloatArray]:
 
 
 def object_centres(data: CocoData, size: tuple[int, int]) -> FloatArray:
-    """Middles [n, 2] of every object of the data set, in pixels of views of `size`."""
+    """Centres [n, 2] of all objects of the data set, in pixels of samples of `size`."""
     middles: list[FloatArray] = [np.zeros((0, 2))]
     for image in data.images:
         fit = Letterbox.fit(image.width, image.height, size, "ultralytics")
@@ -129,7 +125,7 @@ def object_centres(data: CocoData, size: tuple[int, int]) -> FloatArray:
 
 
 def reduced_picture(image: CocoImage, width: int, height: int) -> ImageArray:
-    """The picture [h, w, 3], no smaller than asked; DataSetError as `coco`'s."""
+    """The picture [h, w, 3], at least `width` x `height`; DataSetError as `read_picture`."""
     if image.path.suffix.lower() not in (".jpg", ".jpeg"):
         return read_picture(image)
     try:
@@ -137,14 +133,14 @@ def reduced_picture(image: CocoImage, width: int, height: int) -> ImageArray:
     except OSError as error:
         raise DataSetError(f"{image.path}: cannot be read ({error.strerror})") from error
     except CaptureError:
-        return read_picture(image)  # a PNG by a JPEG's name, or it says what is wrong
+        return read_picture(image)  # a PNG with a JPEG's name, or a specific error
 
 
 class Cropper:
-    """Cuts windows by `CropSettings`; holds what does not change from window to window."""
+    """Cuts windows by `CropSettings`."""
 
-    def __init__(self, settings: CropSettings, seed: int, usual_px: FloatArray) -> None:
-        """`usual_px` [n, 2]: middles of objects in all of the pictures, in pixels of the sample."""
+    def __init__(self, settings: CropSettings, seed: int, centres_px: FloatArray) -> None:
+        """`centres_px` [n, 2]: centres of the objects of all pictures, in pixels of a sample."""
         self._settings = settings
         width, height = (max(side, LARGEST_WINDOW_PX) for side in settings.window)
         random = np.random.default_rng([seed, 1])
@@ -152,7 +148,7 @@ class Cropper:
             np.rint(random.normal(0, strength, (height, width, 3))).astype(np.int16)
             for strength in np.linspace(1, _NOISIEST, _NOISES)
         ]
-        self._usual = usual_px
+        self._centres = centres_px
 
     def __call__(
         self,
@@ -174,21 +170,15 @@ class Cropper:
         move = np.array([[scale, 0.0, -left * scale], [0.0, scale, -top * scale]])
         if flip:
             move[0] = [-scale, 0.0, width + left * scale]
-        # A point between pixels: the window's own first pixel covers scale times as much.
+        # OpenCV counts from pixel centres, boxes from pixel edges.
         middle = np.array([(move[0, 0] - 1) / 2, (scale - 1) / 2])
         warp = move.copy()
         warp[:, 2] += middle
-        rgb = np.asarray(
-            cv2.warpAffine(
-                sample.rgb,
-                warp,
-                (width, height),
-                flags=cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_CONSTANT,
-                borderValue=(PAD, PAD, PAD),
-            ),
-            np.uint8,
+        grey = (PAD, PAD, PAD)
+        cut = cv2.warpAffine(
+            sample.rgb, warp, (width, height), flags=cv2.INTER_LINEAR, borderValue=grey
         )
+        rgb = np.asarray(cut, np.uint8)
         box = sample.box_px * scale - np.array([left, top, left, top]) * scale
         if flip:
             box[:, [0, 2]] = width - box[:, [2, 0]]
@@ -215,28 +205,27 @@ class Cropper:
         kind = random.random() - self._settings.around_object
         mistaken = sample.false_positive_px
         if around is not None:
-            kind = 0.0  # where objects use to be, if not around this one
+            kind = 0.0  # an empty `around`: at a centre of another picture
         elif len(mistaken) and random.random() < self._settings.around_mistaken:
             around = mistaken[int(random.integers(len(mistaken)))]
         if around is not None and len(around):
             box = around
-            # Anywhere in the window, but whole; what is larger than the window fills it.
+            # Whole, anywhere in the window; a larger box fills it.
             slack = (wide, high) - (box[2:] - box[:2])
             left, top = box[:2] - random.uniform(0, 1, 2) * slack
         elif count and kind < 0:
-            # First the class, then the object: parked cars must not crowd out who walks.
+            # First the class, then the object, for classes are unequally frequent.
             kinds = np.unique(sample.class_id)
             mine = np.flatnonzero(sample.class_id == kinds[int(random.integers(len(kinds)))])
             mine = np.repeat(mine, [sample.sampling_weight(int(index)) for index in mine])
             box = sample.box_px[mine[int(random.integers(len(mine)))]]
-            middle = (box[:2] + box[2:]) / 2
-            left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)
-        elif len(self._usual) and kind < self._settings.around_usual:
-            middle = self._usual[int(random.integers(len(self._usual)))]
-            left, top = middle - random.uniform(0.1, 0.9, 2) * (wide, high)
+            left, top = (box[:2] + box[2:]) / 2 - random.uniform(0.1, 0.9, 2) * (wide, high)
+        elif len(self._centres) and kind < self._settings.around_usual:
+            centre = self._centres[int(random.integers(len(self._centres)))]
+            left, top = centre - random.uniform(0.1, 0.9, 2) * (wide, high)
         else:
             left, top = random.uniform(0, 1, 2) * (across - wide, down - high)
-        # The window stays on the sample as far as it fits, as the camera's picture does.
+        # The window stays within the sample as far as it fits.
         return (
             float(np.clip(left, min(0, across - wide), max(0, across - wide))),
             float(np.clip(top, min(0, down - high), max(0, down - high))),
@@ -263,7 +252,7 @@ class Cropper:
 
 
 def _window_labels(rgb: ImageArray, box: FloatArray, sample: Sample, size: tuple[int, int]) -> Crop:
-    """Which objects are in the window, and which of them cannot be asked for."""
+    """The window with its objects; too small or cut ones are ignored."""
     width, height = size
     inside = np.clip(box, 0, (width, height, width, height))
     area = np.prod(np.maximum(box[:, 2:] - box[:, :2], 1e-9), axis=1)

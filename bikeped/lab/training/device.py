@@ -1,4 +1,4 @@
-"""What the small network is trained on: which processor or GPU, and what it multiplies itself."""
+"""Training device: processor or GPU, and its support of bfloat16."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bikeped.errors import DetectorError
 
 
 def resolve_device(asked: str) -> str:
-    """PyTorch's name of the device `asked`: `auto`, `cpu`, or a GPU's number; DetectorError."""
+    """PyTorch's name of the device `auto`, `cpu`, or a GPU's number; DetectorError if unusable."""
     if asked == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     device = f"cuda:{asked}" if asked.isdigit() else asked
@@ -25,7 +25,7 @@ def resolve_device(asked: str) -> str:
 
 
 def supports_bfloat16(device: str) -> bool:
-    """Whether it multiplies bfloat16 itself (of processors: AVX-512 BF16, AMX, or Arm's BF16)."""
+    """Whether the device has bfloat16 hardware (of processors: AVX-512 BF16, AMX, Arm's BF16)."""
     if torch.device(device).type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     try:

@@ -1,17 +1,14 @@
-"""Drawn pictures to learn from: many streets, lights and cameras, every part from its own seed.
+"""Draws training sets: many streets, lights and cameras, every part from its own seed.
 
-Nine parts in ten are seen by the configured camera, moved and turned a little; the others through
-fisheye lenses, heights and pitches of every kind. Street, place, light, weather, clothes and who is
-about follow from the seeds of `bikeped.lab.rendering`.
+Most parts are views of the configured camera, moved and turned a little; the others of random
+fisheye lenses, heights and pitches. All else depends on the seeds of `bikeped.lab.rendering`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +19,23 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import DataSetError
 from bikeped.files import make_folder
 from bikeped.geometry import CameraPose
+from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import SceneCamera, scene_camera
 from bikeped.lab.rendering.dataset import write_dataset
 from bikeped.lab.rendering.random_scene import SceneMix
 from bikeped.lab.rendering.render_camera import DEFAULT_POSE
 from bikeped.lab.training.coco import write_annotations
 
-#: Seeds of parts begin here, so that no set shares a street with another: training from
-#: `seed` * this, below the next one.
+#: Seeds of a set's parts begin at its seed times this: sets share no street.
 SEEDS_A_SET = 10_000
-#: More of what is hard to tell than in the streets that a detector is tested on.
+#: More difficult cases than in the streets that a detector is tested on.
 HARD_MIX = SceneMix(scooters=0.4, wheelchairs=0.2, beside=0.45, clutter=9)
 _SMALL, _LARGE = (1280, 720), (1920, 1080)
 
 
 @dataclass(frozen=True)
 class DrawnSettings:
-    """How many pictures, of what kind."""
+    """Number and kind of pictures."""
 
     pictures: int = 5000
     seed: int = 1
@@ -74,7 +71,7 @@ def draw_training_set(
     images: list[dict[str, Any]] = []
     notes: list[dict[str, Any]] = []
     header: dict[str, Any] = {}
-    with ProcessPoolExecutor(settings.processes, mp_context=get_context("spawn")) as pool:
+    with worker_pool(settings.processes) as pool:
         answers = [pool.submit(_draw, *job, settings, loaded) for job in jobs]
         for answer in answers:
             data = json.loads(answer.result().read_text(encoding="utf-8"))
@@ -83,14 +80,9 @@ def draw_training_set(
             for image in data["images"]:
                 name = f"{part}/images/{image['file_name']}"
                 images.append(image | {"id": image["id"] + shift_image, "file_name": name})
-            notes += [
-                note
-                | {
-                    "id": note["id"] + shift_note,
-                    "image_id": note["image_id"] + shift_image,
-                }
-                for note in data["annotations"]
-            ]
+            for note in data["annotations"]:
+                ids = {"id": note["id"] + shift_note, "image_id": note["image_id"] + shift_image}
+                notes.append(note | ids)
             header = {"info": {"description": "drawn by bikeped"}, "categories": data["categories"]}
             progress(len(images))
     write_annotations(folder / "annotations.json", header, images, notes)
@@ -118,12 +110,6 @@ def _draw(
 ) -> Path:
     cv2.setNumThreads(1)
     camera, size = part_camera(settings, number, loaded)
-    return write_dataset(
-        folder / f"{number:04d}",
-        count,
-        settings.seed * SEEDS_A_SET + number,
-        camera,
-        size=size,
-        lens=settings.lens,
-        mix=settings.mix,
-    )
+    seed, target = settings.seed * SEEDS_A_SET + number, folder / f"{number:04d}"
+    lens, mix = settings.lens, settings.mix
+    return write_dataset(target, count, seed, camera, size=size, lens=lens, mix=mix)

@@ -1,7 +1,7 @@
-"""A TensorRT engine from an ONNX file, built on the machine that will run it.
+"""Builds a TensorRT engine from an ONNX file, on the machine that will run it.
 
-An engine fits one GPU and one TensorRT version, so it is built on the Jetson itself, through the
-system's `tensorrt` package. In front of it stands what `bikeped.detection` reads: four bytes of
+An engine fits one GPU and one TensorRT version, so it is built on the Jetson, with the system's
+`tensorrt` package. The file begins with a header that `bikeped.detection` reads: four bytes of
 length, little-endian, and that many bytes of JSON (as Ultralytics writes it).
 """
 
@@ -23,7 +23,7 @@ _OLDEST = 10  #: TensorRT's major version; JetPack 6 has 10
 
 @dataclass(frozen=True)
 class EngineSummary:
-    """What was built."""
+    """The engine file."""
 
     path: Path
     source: Path
@@ -52,9 +52,8 @@ def build_engine(
 ) -> EngineSummary:
     """Builds `out` from the ONNX file `model`; takes minutes. Raises DetectorError.
 
-    `half` lets TensorRT use 16-bit floats where the GPU has fast ones; `workspace_mb` bounds the
-    memory that it tries plans with. `size`: width and height of the input of a model that takes
-    any; None: what its metadata say.
+    `half` allows 16-bit floats where the GPU has fast ones; `workspace_mb` bounds the memory of the
+    search. `size`: input width and height, for a model of any size; None: as its metadata say.
     """
     trt = _tensorrt(out)
     try:
@@ -62,10 +61,10 @@ def build_engine(
     except OSError as error:
         raise DetectorError(f"{model}: cannot be read ({error.strerror})") from error
     facts = onnx_facts(model)
-    known = parse_metadata(facts, str(model))  # what the loader would refuse is refused now
+    known = parse_metadata(facts, str(model))  # refuses what the loader would refuse
     logger = trt.Logger(trt.Logger.WARNING)
     builder = trt.Builder(logger)
-    # TensorRT 10 knows explicit batches only, and takes no flag for them.
+    # TensorRT 10 has explicit batches only, without a flag.
     network = builder.create_network(0)
     parser = trt.OnnxParser(network, logger)
     if not parser.parse(content):
@@ -100,8 +99,8 @@ def _fix_size(
     asked: tuple[int, int] | None,
     known: tuple[int, int] | None,
 ) -> None:
-    """Gives an input that may have any size the one that is asked for, else the one that the model
-    knows; a fixed one must have what is asked for."""
+    """Sets a dynamic input to the size asked for, else to the model's known one; a fixed input must
+    have the size asked for."""
     taken = network.get_input(0)
     shape = list(taken.shape)
     if len(shape) != 4:

@@ -1,7 +1,7 @@
-"""Trains the small network on any data set in COCO's format: batches, steps, a mean of the weights.
+"""Trains the small network on a data set in COCO's format.
 
-Same data, seed and settings give the same weights on the same kind of processor (PyTorch promises
-no more than that). Nothing depends on the time that anything takes.
+The same data, seed and settings give the same weights on the same kind of processor (PyTorch
+guarantees no more). Nothing depends on timing.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -41,22 +41,21 @@ _STEEPEST_GRADIENT = 10.0
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How long and how the network learns."""
+    """Hyperparameters of the training."""
 
     steps: int = 6000
-    packed: float = 0.85  #: share of the steps, the first ones, that see windows laid side by side
-    pictures: int = 8  #: read for each step
-    windows: int = 1  #: cut from each of them in the steps that see no squares
-    rate: float = 2e-3  #: highest learning rate, of AdamW
-    matrix_rate: float = 0.02  #: highest learning rate of the convolutions, of Muon; 0: AdamW's
-    decay: float = 0.02  #: of the weights
-    warmup: int = 100  #: steps until the highest rate
-    memory: float = 0.997  #: of the running mean of the weights
+    packed: float = 0.85  #: share of the steps, the first ones, on packed squares
+    pictures: int = 8  #: per step
+    windows: int = 1  #: per picture, in the steps on plain windows
+    rate: float = 2e-3  #: peak learning rate of AdamW
+    matrix_rate: float = 0.02  #: peak learning rate of Muon, for convolutions; 0: AdamW only
+    decay: float = 0.02  #: weight decay
+    warmup: int = 100  #: steps until the peak rate
+    memory: float = 0.997  #: decay of the moving average of the weights
     seed: int = 0
-    workers: int = 2  #: threads, each with its part of every step
-    #: The squares' convolutions in 16 bits: four fifths of the time on what knows it, six times as
-    #: long on what does not. The loss and the steps that see no squares are float32, as what ships
-    #: is. `device.supports_bfloat16` tells.
+    workers: int = 2  #: threads, each with a part of every step
+    #: Convolutions of the packed steps in bfloat16: 0.8 of the time with hardware support, 6 times
+    #: the time without (`device.supports_bfloat16`). The loss and the plain steps are float32.
     bfloat16: bool = False
     device: str = "cpu"
     crops: CropSettings = field(default_factory=CropSettings)
@@ -66,13 +65,13 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FitResult:
-    """The trained network, what it knows, and how it came to be."""
+    """The trained network and the record of its training."""
 
     network: SmallNet
     names: tuple[str, ...]
     size: tuple[int, int]  #: width and height of the input
-    losses: list[dict[str, float]]  #: means over every hundred steps
-    mistakes: list[int]  #: that each look at the pictures found
+    losses: list[dict[str, float]]  #: means over each hundred steps
+    mistakes: list[int]  #: false positives of each mining round
     seconds: float
 
 
@@ -97,7 +96,7 @@ def fit(
     losses: list[dict[str, float]] = []
     mistakes: list[int] = []
     sums: dict[str, float] = {}
-    looks = {round(share * settings.steps) for share in settings.mining.after}
+    rounds = {round(share * settings.steps) for share in settings.mining.after}
     with ThreadPoolExecutor(len(workers)) as pool:
         ready = [pool.submit(worker.prepare, 0) for worker in workers]
         for step in range(settings.steps):
@@ -107,21 +106,19 @@ def fit(
                     group["lr"] = group["highest"] * share
             for done in ready:
                 done.result()
-            if step in looks:
+            if step in rounds:
                 mined, count = mine_false_positives(
                     copy.deepcopy(mean).cpu(), data, shown_size(settings.crops), settings.mining
                 )
                 mistakes.append(count)
-                say(
-                    f"step {step}, {time.monotonic() - began:.0f} s: {count} mistakes to learn from"
-                )
+                say(f"step {step}, {time.monotonic() - began:.0f} s: {count} false positives")
                 for worker in workers:
                     worker.data = mined
             answers = [pool.submit(worker.learn) for worker in workers]
             for answer in answers:
                 for name, part in answer.result().items():
                     sums[name] = sums.get(name, 0.0) + part / len(workers) / _REPORT_EVERY
-            # The next pictures are read while this step is taken.
+            # The next pictures are read during this step.
             if step + 1 < settings.steps:
                 ready = [pool.submit(worker.prepare, step + 1) for worker in workers]
             _join(network, workers)
@@ -153,24 +150,19 @@ def shown_size(crops: CropSettings) -> tuple[int, int]:
 
 
 def learning_rate(step: int, settings: FitSettings) -> float:
-    """Rises evenly over the warm-up, then falls along half a cosine to a fiftieth."""
+    """Linear warm-up, then half a cosine down to a fiftieth of the peak."""
     if step < settings.warmup:
         return settings.rate * (step + 1) / settings.warmup
     done = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
     return settings.rate * (0.02 + 0.98 * (1 + math.cos(math.pi * done)) / 2)
 
 
-def settings_as_dict(settings: FitSettings) -> dict[str, Any]:
-    """The settings as plain values."""
-    return asdict(settings)
-
-
 class _Worker:
-    """A part of every step: reads its pictures, cuts its windows, and finds its own gradient.
+    """A part of every step: reads its pictures, cuts its windows and computes its gradient.
 
-    Each runs on one thread of its own and answers for a copy of the network that shares the
-    weights. Threads within one operation would wait for one another thousands of times a step.
-    What is read follows from the seed, the step and the part alone.
+    Each has a thread of its own and a copy of the network that shares the weights: threads within
+    one operation would synchronise thousands of times a step. Its pictures depend on the seed, the
+    step and the part only.
     """
 
     def __init__(
@@ -186,17 +178,16 @@ class _Worker:
         self._packed = True
 
     def prepare(self, step: int) -> None:
-        """Reads and cuts what `learn` will learn from."""
+        """Reads and cuts the windows of the next `learn`."""
         torch.set_num_threads(1)
         self._packed = step < self._settings.packed * self._settings.steps
         crops = self._squares(step) if self._packed else self._crops(step)
         self._ready = _tensors(crops, self._device)
-        # What the squares normalised by stays as it is: plain windows are mostly asphalt, and
-        # people would look different to the network than while it learnt them.
+        # Batch statistics of the squares are kept: plain windows are mostly background.
         _keep_statistics(self.network, not self._packed)
 
     def learn(self) -> dict[str, float]:
-        """Leaves the gradient in the copy; returns the parts of the loss."""
+        """Computes the gradient of the copy; returns the parts of the loss."""
         torch.set_num_threads(1)
         pictures, truths = self._ready
         half = self._settings.bfloat16 and self._packed
@@ -211,9 +202,9 @@ class _Worker:
         return parts
 
     def _squares(self, step: int) -> list[Crop]:
-        """Windows laid side by side, from a pool of pictures that is renewed bit by bit."""
+        """Packed squares, from a pool of pictures that is renewed step by step."""
         pack, workers = self._settings.pack, self._settings.workers
-        # The first step fills the pool; every later one reads on from there.
+        # The first step fills the pool.
         end = max(pack.pool, self._settings.pictures) + step * self._settings.pictures
         first = end - self._settings.pictures if step else 0
         self._pool += self._views(range(first, end))
@@ -222,7 +213,7 @@ class _Worker:
         return self._packer(self._pool, pack.squares // workers, random)
 
     def _crops(self, step: int) -> list[Crop]:
-        """Windows as they are in the pictures."""
+        """Plain windows."""
         settings = self._settings
         random = np.random.default_rng([settings.seed, 2, step, self._part])
         mine = range(step * settings.pictures, (step + 1) * settings.pictures)
@@ -241,7 +232,7 @@ class _Worker:
         ]
 
     def _picture(self, number: int) -> int:
-        """Every picture once a round, in another order each round."""
+        """Every picture once an epoch, in a new order each epoch."""
         count = len(self.data.images)
         turn, place = divmod(number, count)
         return int(np.random.default_rng([self._settings.seed, 3, turn]).permutation(count)[place])
@@ -260,7 +251,7 @@ def _workers(network: SmallNet, data: CocoData, settings: FitSettings) -> list[_
 
 
 def _join(network: SmallNet, workers: list[_Worker]) -> None:
-    """The mean of the workers' gradients and of their normalisations' statistics, in `network`."""
+    """Averages the workers' gradients and batch statistics into `network`."""
     with torch.no_grad():
         for own, *others in zip(*(w.network.parameters() for w in workers), strict=True):
             if own.grad is not None:
@@ -278,7 +269,7 @@ def _join(network: SmallNet, workers: list[_Worker]) -> None:
 
 def _tensors(crops: list[Crop], device: torch.device) -> tuple[torch.Tensor, list[ImageLabels]]:
     stacked = torch.from_numpy(np.stack([crop.rgb for crop in crops])).to(device)
-    # Channels last in memory is how the pictures lie already: this moves no bytes.
+    # The pictures are channels-last in memory already: this copies nothing.
     pictures = stacked.permute(0, 3, 1, 2).float() / 255
     truths = [
         ImageLabels(
@@ -298,8 +289,8 @@ def _keep_statistics(network: SmallNet, keep: bool) -> None:
 
 
 def _optimisers(network: SmallNet, settings: FitSettings) -> list[torch.optim.Optimizer]:
-    """Muon for the convolutions within, AdamW for the last ones, which say the answer, and for
-    biases and normalisations, which are not pulled to zero."""
+    """Muon for the inner convolutions; AdamW for the last ones, and without weight decay for biases
+    and normalisations."""
     last = {
         id(p) for head in network.heads for m in (head.score, head.edge) for p in m.parameters()
     }
@@ -322,7 +313,7 @@ def _optimisers(network: SmallNet, settings: FitSettings) -> list[torch.optim.Op
 
 
 def _average(mean: SmallNet, network: SmallNet, share: float) -> None:
-    """Moves the running mean of weights (and of normalisation's statistics) on by one step."""
+    """Updates the moving average of weights and batch statistics."""
     with torch.no_grad():
         for kept, new in zip(
             mean.state_dict().values(), network.state_dict().values(), strict=True

@@ -1,7 +1,7 @@
-"""What there is to find, as arrays: a data set's boxes by class, or as road users.
+"""Ground truth of a data set as arrays: boxes by class, or as road users.
 
-Road users are what the deployed detector means by them: a person on a bicycle and the bicycle are
-one cyclist, joined here by the very function that joins the detector's answers.
+Road users are as deployed: a person on a bicycle and the bicycle are one cyclist, joined by the
+function that joins the detector's boxes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def kinds_by_name(names: Mapping[int, str], detection: DetectionConfig) -> dict[
 
 
 def category_truth(data: CocoData, group_of: Mapping[int, int]) -> GroundTruth:
-    """The data's boxes, their categories mapped by `group_of`; others are left out."""
+    """Boxes with their categories mapped by `group_of`; others are left out."""
     rows = _TruthBuilder()
     for number, picture in enumerate(data.images):
         for thing in data.objects[picture.id]:
@@ -49,7 +49,7 @@ def category_truth(data: CocoData, group_of: Mapping[int, int]) -> GroundTruth:
 def road_user_truth(
     data: CocoData, kind_of: Mapping[int, Kind], detection: DetectionConfig
 ) -> GroundTruth:
-    """The data's road users as the deployed detector means them: riders joined to their cycles."""
+    """Road users by kind, riders joined to their cycles."""
     rows = _TruthBuilder()
     bare = {
         i
@@ -106,5 +106,5 @@ class _TruthBuilder:
 
 
 def plain_name(name: str) -> str:
-    """A class name as it is compared: without regard to case and outer blanks."""
+    """A class name for comparison: lower case, without outer blanks."""
     return name.strip().lower()

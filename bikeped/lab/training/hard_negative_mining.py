@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -22,6 +20,7 @@ import numpy as np
 from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.geometry.boxes import iou_matrix
+from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.training.coco import FALSE_POSITIVE, CocoData, CocoImage, furniture
 from bikeped.lab.training.crops import reduced_picture
 from bikeped.lab.training.export import export_network
@@ -63,7 +62,7 @@ def mine_false_positives(
         whole, model = Path(folder) / "whole.onnx", Path(folder) / "model.onnx"
         export_network(SmallDetector(network, names, size), whole)
         quantise(whole, calibration_images(data, size), model)
-        with ProcessPoolExecutor(settings.processes, mp_context=get_context("spawn")) as pool:
+        with worker_pool(settings.processes) as pool:
             parts = [
                 pool.submit(_false_positives, model, labelled[part :: settings.processes], settings)
                 for part in range(settings.processes)
@@ -82,8 +81,8 @@ def _false_positives(
 ) -> dict[int, FloatArray]:
     """False positives [n, 4] by picture id; runs in a process of its own."""
     cv2.setNumThreads(1)
-    order = DetectionConfig(model=str(model), confidence=settings.confidence, threads=1)
-    detector = load_detector(order, Path("/"))
+    config = DetectionConfig(model=str(model), confidence=settings.confidence, threads=1)
+    detector = load_detector(config, Path("/"))
     found = {}
     for image, objects in labelled:
         rgb = reduced_picture(image, *detector.decode_size(image.width, image.height))
@@ -98,5 +97,5 @@ def _with_false_positives(image: CocoImage, mistaken: FloatArray) -> CocoImage:
     """`image` with these false positives, and no others."""
     things = [(what, box) for what, box in furniture(image) if what != FALSE_POSITIVE]
     things += [(FALSE_POSITIVE, box) for box in mistaken.tolist()]
-    told = [{"what": w, "bbox": [u1, v1, u2 - u1, v2 - v1]} for w, (u1, v1, u2, v2) in things]
-    return replace(image, entry={**image.entry, "furniture": told})
+    entry = [{"what": w, "bbox": [u1, v1, u2 - u1, v2 - v1]} for w, (u1, v1, u2, v2) in things]
+    return replace(image, entry={**image.entry, "furniture": entry})

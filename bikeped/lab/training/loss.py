@@ -1,10 +1,9 @@
-"""What the small network is told: which cells answer for an object, and how wrong they are.
+"""Loss of the small network: assignment of cells to objects, classification and box terms.
 
-Cells are given to objects as in TOOD (Feng et al. 2021, "task-aligned one-stage object detection"):
-a cell is good for an object when it already scores its class high and already boxes it well, so the
-score learns to say how well the box fits. Differences from the paper: objects are tiny here, so a
-cell may lie up to one fine cell beside an object that is smaller than that; and the lower edge,
-which is what is put on the ground, counts more than the others.
+Cells are assigned as in TOOD (Feng et al. 2021, "task-aligned one-stage object detection"), by
+their score for the object's class and the IoU of their box: the score learns the box's quality.
+Differences from the paper: a cell may lie up to one fine cell beside a tiny object; and the lower
+edge, which is mapped to the ground, has more weight than the others.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ import torch
 
 from bikeped.lab.training.network import boxes_px
 
-_SCORE_POWER, _OVERLAP_POWER = 0.5, 6.0  #: of the alignment: score^0.5 * overlap^6
-#: A score is asked to be the overlap to this power: who is tiny, or half hidden, is never boxed as
-#: well as others, and must not be doubted for it.
+_SCORE_POWER, _OVERLAP_POWER = 0.5, 6.0  #: of the alignment: score^0.5 * IoU^6
+#: The target score is the IoU to this power: boxes of tiny or occluded objects are never as exact,
+#: and that must not lower their score.
 _TARGET_POWER = 0.15
 _CELLS_AN_OBJECT = 10
-_LEAST_REACH_PX = 8.0  #: cells this far from the middle of a tiny object may answer for it
+_LEAST_REACH_PX = 8.0  #: cells this far from the middle of a tiny object are candidates
 _EDGE_WEIGHTS = (0.5, 0.5, 0.5, 1.5)  #: left, top, right, bottom
 _OVERLAP_GAIN, _EDGE_GAIN = 5.0, 2.0
 _TINY = 1e-9
@@ -29,9 +28,9 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class ImageLabels:
-    """What is in one picture: `box_px` [m, 4], `class_id` [m] int64, `ignored_px` [k, 4].
+    """Labels of one picture: `box_px` [m, 4], `class_id` [m] int64, `ignored_px` [k, 4].
 
-    Cells in an ignored box (a crowd, somebody nearly hidden) are not told that nobody is there.
+    Cells in an ignored box (a crowd, a nearly hidden object) are no negative examples.
     """
 
     box_px: torch.Tensor
@@ -41,10 +40,8 @@ class ImageLabels:
 
 @dataclass(frozen=True)
 class Assignment:
-    """For every cell of one picture: `chosen` [cells] bool, `target` [cells] index of its object.
-
-    `quality` [cells] is what the cell's score should be, 0 where not chosen.
-    """
+    """For every cell of one picture: `chosen` [cells] bool, `target` [cells] index of its object,
+    `quality` [cells] its target score, 0 where not chosen."""
 
     chosen: torch.Tensor
     target: torch.Tensor
@@ -60,8 +57,8 @@ def detection_loss(
 ) -> tuple[torch.Tensor, dict[str, float]]:
     """The loss of a batch, and its parts.
 
-    `score` [n, classes, cells] before the sigmoid and `edge` [n, 4, cells] as `SmallNet` gives
-    them; one truth a picture; `centre` and `stride` of `network.grid`.
+    `score` [n, classes, cells] before the sigmoid and `edge` [n, 4, cells] of `SmallNet`; `truths`
+    [n]; `centre` and `stride` of `network.grid`.
     """
     score, box = score.float(), boxes_px(edge.float(), centre, stride)
     wanted = torch.zeros_like(score)
@@ -93,7 +90,7 @@ def detection_loss(
         quality = torch.cat(qualities)
         parts["overlap"] = _OVERLAP_GAIN * (torch.cat(overlaps) * quality).sum() / many
         parts["edge"] = _EDGE_GAIN * (torch.cat(edges) * quality).sum() / many
-    # Also of a batch with nobody in it, every weight has a gradient: nought.
+    # In a batch without objects, too, every weight has a gradient: zero.
     total: Any = sum(parts.values()) + 0.0 * edge.float().sum()
     return total, {name: float(part.detach()) for name, part in parts.items()}
 
@@ -101,15 +98,15 @@ def detection_loss(
 def assign(
     probability: torch.Tensor, box: torch.Tensor, truth: ImageLabels, centre: torch.Tensor
 ) -> Assignment:
-    """Which cells of one picture answer for which object (see the module's head).
+    """Assigns cells of one picture to objects (see the module's docstring).
 
     `probability` [classes, cells], `box` [cells, 4], `centre` [cells, 2]. Each object takes the
-    cells that fit it best, a cell that several want answers for the one that it overlaps most.
+    best-aligned cells; a cell of several objects goes to the one of highest IoU.
     """
     near = _inside(centre, truth.box_px)
     overlap = pairwise_iou(truth.box_px, box) * near
     fit = probability[truth.class_id] ** _SCORE_POWER * overlap**_OVERLAP_POWER
-    # Before it has learnt anything a network overlaps nothing: then the nearest cells answer.
+    # An untrained network overlaps nothing: then the nearest cells are taken.
     middle = (truth.box_px[:, None, :2] + truth.box_px[:, None, 2:]) / 2
     nearness = 1 / (1 + (centre[None] - middle).square().sum(2))
     rank = torch.where(near, fit + _TINY * nearness, -1.0)

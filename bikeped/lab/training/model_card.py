@@ -1,16 +1,14 @@
-"""What a model is worth on drawn streets that it never saw: the numbers of its card.
+"""Tests a model on drawn streets outside its training: the figures of its card.
 
-Pictures are drawn from seeds, places and lights outside the training's, encoded and decoded as the
-camera's are, and shown to the model through the very `load_detector` of the service.
+Pictures are drawn from other seeds, places and lights than the training's, encoded and decoded as
+the camera's are, and go through the service's `load_detector`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +21,26 @@ from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection import Detector, load_detector
 from bikeped.geometry import road_region
 from bikeped.geometry.boxes import iou_matrix
+from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, scene_camera
 from bikeped.lab.rendering.clip import encode_jpeg
 from bikeped.lab.rendering.dataset import pictures
-from bikeped.types import Detections, FloatArray, Kind, Region
+from bikeped.types import Detections, Kind, Region
 
 #: Bounds of the distance rings, metres along the ground from below the lens.
 RINGS_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0)
 NEAR_M = 15.0  #: the requirement's range
-LEAST_VISIBLE = 0.3  #: of somebody, or nobody is asked to see it
-#: Of whom this much shows is "reasonable" to ask for, as in the Caltech pedestrian benchmark
-#: (Dollar et al. 2012, section 3.3): told beside the stricter figure.
+LEAST_VISIBLE = 0.3  #: visible share of an object that counts
+#: The "reasonable" visible share of the Caltech pedestrian benchmark (Dollar et al. 2012, section
+#: 3.3), reported beside the stricter figure.
 MOSTLY_VISIBLE = 0.65
 LEAST_SIDE_PX = 5.0  #: of its box at 960 pixels across
 MATCH_IOU = 0.5
-#: A detection that overlaps somebody of its kind by less than `MATCH_IOU`, but by this, boxes him
-#: loosely: he is not found, and yet nobody is made up. The bound and the sorting of errors are
-#: TIDE's (Bolya et al. 2020, section 2.2).
+#: A detection whose IoU with an object of its kind is below `MATCH_IOU`, but at least this, is a
+#: localisation error, not a false positive: bound and error types of TIDE (Bolya et al. 2020,
+#: section 2.2).
 LOOSE_IOU = 0.1
+WARNED = (Kind.PEDESTRIAN, Kind.CYCLIST)  #: kinds that cause warnings
 _EXTRA = ("false", "loose", "another_kind")
 _QUALITY = 88
 _FAR = 35.0
@@ -48,8 +48,8 @@ _FAR = 35.0
 
 @dataclass(frozen=True)
 class DrawnTest:
-    """`pictures` at 1920 x 1080 from `seed` on; `own_lens`: through fisheyes of every kind instead
-    of the configured camera."""
+    """`pictures` from `seed` on; `own_lens`: through fisheye lenses of all kinds in place of the
+    configured camera."""
 
     pictures: int = 400
     seed: int = 9_000_001
@@ -61,20 +61,20 @@ class DrawnTest:
 
 @dataclass(frozen=True)
 class DetectionRecord:
-    """One object of one picture, or one detection that is nobody (`distance_m` NaN)."""
+    """One object of one picture, or one unmatched detection (`distance_m` NaN)."""
 
     kind: Kind
     distance_m: float
     found: bool
     confidence: float  #: 0 where not found
     error_m: float  #: of the box's bottom centre on the ground; NaN where not found or no ground
-    on_other: bool = False  #: a detection that is somebody, but of another kind
-    loose: bool = False  #: a detection that overlaps somebody of its kind, but too little
-    visible: float = 1.0  #: share of the object that shows
+    on_other: bool = False  #: the detection matches an object of another kind
+    loose: bool = False  #: the detection overlaps an object of its kind, but too little
+    visible: float = 1.0  #: visible share of the object
 
     @property
     def extra(self) -> str | None:
-        """What a detection that found nobody is: `another_kind`, `loose` or `false`."""
+        """Error type of an unmatched detection: `another_kind`, `loose` or `false`."""
         if not np.isnan(self.distance_m):
             return None
         return "another_kind" if self.on_other else "loose" if self.loose else "false"
@@ -93,7 +93,7 @@ def drawn_test(
     test: DrawnTest,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[list[list[list[DetectionRecord]]], list[str]]:
-    """For each model what it made of every picture, and every picture's light and weather.
+    """The records of each model by picture, and every picture's light (or rain).
 
     `model.model` is an absolute path.
     """
@@ -102,7 +102,7 @@ def drawn_test(
     seen: list[list[list[DetectionRecord]]] = [[] for _ in models]
     lights = []
     for jpeg, objects, view, conditions in _drawn(loaded, test):
-        # Each camera's road, as the service has it of its own camera.
+        # The road of each camera, as the service crops its own.
         region = road_region(view.camera, view.framing, range_m)
         if region not in detectors:
             detectors[region] = [load_detector(model, Path("/"), region) for model in models]
@@ -114,91 +114,70 @@ def drawn_test(
 
 
 def summary_by_light(
-    seen: Records, lights: Sequence[str], confidence: float
+    records: Records, lights: Sequence[str], confidence: float
 ) -> dict[str, dict[str, Any]]:
-    """For every light (rain by itself): frames, recall within 15 m by kind, false a 100 frames."""
+    """Frames, recall within 15 m and false positives per 100 frames by light; rain is one."""
     rows: dict[str, dict[str, Any]] = {}
     for light in sorted(set(lights)):
-        numbers = summary(
-            [s for s, it in zip(seen, lights, strict=True) if it == light], confidence
-        )
-        rows[light] = {
-            "frames": numbers["frames"],
-            "false_per_100_frames": numbers["false_pedestrian_or_cyclist_per_100_frames"],
-            **{
-                kind.label: numbers["kinds"][kind.label]["within_15_m"]["recall"]
-                for kind in (Kind.PEDESTRIAN, Kind.CYCLIST)
-            },
-        }
+        chosen = [record for record, it in zip(records, lights, strict=True) if it == light]
+        numbers = summary(chosen, confidence)
+        rows[light] = {"frames": numbers["frames"], **_headline(numbers)}
     return rows
 
 
-def summary(seen: Records, confidence: float) -> dict[str, Any]:
-    """The numbers at one confidence: recall and error by kind and ring, false ones a 100 frames."""
-    rows = [s for picture in seen for s in picture]
-    result: dict[str, Any] = {"frames": len(seen), "confidence": confidence, "kinds": {}}
+def summary(records: Records, confidence: float) -> dict[str, Any]:
+    """Recall and error by kind and ring, and false positives per 100 frames, at one confidence."""
+    rows = [record for picture in records for record in picture]
+    kinds: dict[str, dict[str, Any]] = {}
     for kind in Kind:
-        mine = [s for s in rows if s.kind == kind and not np.isnan(s.distance_m)]
-        rings = [
-            {"from_m": low, "to_m": high, **_numbers(mine, low, high, confidence)}
-            for low, high in pairwise(RINGS_M)
-        ]
-        extra = [s.extra for s in rows if s.kind == kind and s.confidence >= confidence]
-        result["kinds"][kind.label] = {
-            "within_15_m": _numbers(mine, 0, NEAR_M, confidence),
-            "within_15_m_mostly_visible": _numbers(
-                [s for s in mine if s.visible >= MOSTLY_VISIBLE], 0, NEAR_M, confidence
-            ),
-            "rings": rings,
+        own = [r for r in rows if r.kind == kind and not np.isnan(r.distance_m)]
+        visible = [r for r in own if r.visible >= MOSTLY_VISIBLE]
+        extra = [r.extra for r in rows if r.kind == kind and r.confidence >= confidence]
+        kinds[kind.label] = {
+            "within_15_m": _numbers(own, 0, NEAR_M, confidence),
+            "within_15_m_mostly_visible": _numbers(visible, 0, NEAR_M, confidence),
+            "rings": [
+                {"from_m": low, "to_m": high, **_numbers(own, low, high, confidence)}
+                for low, high in pairwise(RINGS_M)
+            ],
             **{
-                f"{what}_per_100_frames": _per_100_frames(extra.count(what), seen)
+                f"{what}_per_100_frames": round(100 * extra.count(what) / max(1, len(records)), 3)
                 for what in _EXTRA
             },
         }
+    result = {"frames": len(records), "confidence": confidence, "kinds": kinds}
     for what in _EXTRA:
-        result[f"{what}_pedestrian_or_cyclist_per_100_frames"] = round(
-            sum(
-                result["kinds"][k.label][f"{what}_per_100_frames"]
-                for k in (Kind.PEDESTRIAN, Kind.CYCLIST)
-            ),
-            3,
-        )
+        both = sum(kinds[kind.label][f"{what}_per_100_frames"] for kind in WARNED)
+        result[f"{what}_pedestrian_or_cyclist_per_100_frames"] = round(both, 3)
     return result
 
 
-def _per_100_frames(count: int, seen: Records) -> float:
-    return round(100 * count / max(1, len(seen)), 3)
+def _headline(numbers: dict[str, Any]) -> dict[str, Any]:
+    recalls = {k.label: numbers["kinds"][k.label]["within_15_m"]["recall"] for k in WARNED}
+    false = numbers["false_pedestrian_or_cyclist_per_100_frames"]
+    return {"false_per_100_frames": false, **recalls}
 
 
-def sweep(seen: Records, confidences: Sequence[float]) -> list[dict[str, float]]:
-    """Recall within 15 m and false ones a 100 frames over confidences: how to choose one."""
+def sweep(records: Records, confidences: Sequence[float]) -> list[dict[str, float]]:
+    """Recall within 15 m and false positives per 100 frames at each of `confidences`."""
     rows = []
     for confidence in confidences:
-        numbers = summary(seen, confidence)
-        rows.append(
-            {
-                "confidence": confidence,
-                "false_per_100_frames": numbers["false_pedestrian_or_cyclist_per_100_frames"],
-                **{
-                    f"{what}_per_100_frames": numbers[
-                        f"{what}_pedestrian_or_cyclist_per_100_frames"
-                    ]
-                    for what in _EXTRA[1:]
-                },
-                **{
-                    kind.label: numbers["kinds"][kind.label]["within_15_m"]["recall"]
-                    for kind in (Kind.PEDESTRIAN, Kind.CYCLIST)
-                },
-            }
-        )
+        numbers = summary(records, confidence)
+        other = {
+            f"{what}_per_100_frames": numbers[f"{what}_pedestrian_or_cyclist_per_100_frames"]
+            for what in _EXTRA[1:]
+        }
+        rows.append({"confidence": confidence, **_headline(numbers), **other})
     return rows
 
 
-def choose_confidence(seen: Records, kind: Kind, grid: Sequence[float], most_false: float) -> float:
-    """The lowest confidence of `grid` with at most `most_false` false ones of `kind` a 100 frames;
-    the highest of `grid` where there is none."""
+def choose_confidence(
+    records: Records, kind: Kind, grid: Sequence[float], most_false: float
+) -> float:
+    """The lowest confidence of `grid` with at most `most_false` false positives of `kind` per 100
+    frames; the highest of `grid` where there is none."""
     for confidence in sorted(grid):
-        numbers = summary(seen, confidence)["kinds"][kind.label]
+        numbers = summary(records, confidence)["kinds"][kind.label]
         if numbers["false_per_100_frames"] <= most_false:
             return float(confidence)
     return float(max(grid))
@@ -224,7 +203,7 @@ _Picture = tuple[bytes, list[DrawnObject], SceneCamera, Conditions]
 def _drawn(loaded: LoadedConfig, test: DrawnTest) -> Iterator[_Picture]:
     parts = -(-test.pictures // test.part)
     sizes = [min(test.part, test.pictures - i * test.part) for i in range(parts)]
-    with ProcessPoolExecutor(test.processes, mp_context=get_context("spawn")) as pool:
+    with worker_pool(test.processes) as pool:
         jobs = [
             pool.submit(_part, loaded, test, number, count) for number, count in enumerate(sizes)
         ]
@@ -250,22 +229,20 @@ def _detect(detector: Detector, jpeg: bytes, view: SceneCamera) -> Detections:
 def match_detections(
     found: Detections, objects: Sequence[DrawnObject], view: SceneCamera
 ) -> list[DetectionRecord]:
-    """Greedy by confidence, kind for kind, at an overlap of at least `MATCH_IOU`.
+    """Matches greedily by confidence within a kind, at an IoU of at least `MATCH_IOU`.
 
-    A detection on somebody who is hardly visible, tiny or very far, of whatever kind, is neither
-    right nor wrong. One on somebody of another kind, and one that boxes somebody loosely, are told
-    from one on nobody; the second one on the same person counts as nobody.
+    A detection on an object that is hardly visible, tiny or very far is ignored. Detections on an
+    object of another kind and too loose ones are recorded apart from false positives; a second
+    detection of one object is a false positive.
     """
     least = LEAST_SIDE_PX * view.size[0] / 960
     box = np.array([o.box_px for o in objects], np.float64).reshape(-1, 4)
     side = (box[:, 2:] - box[:, :2]).min(axis=1, initial=np.inf) if len(box) else np.zeros(0)
-    asked = np.array(
-        [
-            o.visible >= LEAST_VISIBLE and s >= least and o.distance_m < _FAR
-            for o, s in zip(objects, side, strict=True)
-        ],
-        bool,
+    visible, distance = (
+        np.array([getattr(o, key) for o in objects], np.float64)
+        for key in ("visible", "distance_m")
     )
+    asked = (visible >= LEAST_VISIBLE) & (side >= least) & (distance < _FAR)
     kind = np.array([int(o.label) for o in objects], np.int64)
     overlap = iou_matrix(found.box_px.astype(np.float64), box)
     taken: dict[int, int] = {}
@@ -285,7 +262,8 @@ def match_detections(
             score, label = float(found.confidence[d]), Kind(int(found.kind[d]))
             loose = LOOSE_IOU <= most < MATCH_IOU
             rows.append(DetectionRecord(label, np.nan, False, score, np.nan, other, loose))
-    ground, valid = _ground(found, view)
+    # Bottom centres on the ground [n, 2], and which of them lie there.
+    ground, valid = view.camera.ground(view.framing.frame_to_crop(found.bottom_centre_px()))
     for o in np.nonzero(asked)[0].tolist():
         item, d = objects[o], taken.get(o, -1)
         error = np.nan
@@ -298,9 +276,3 @@ def match_detections(
             )
         )
     return rows
-
-
-def _ground(found: Detections, view: SceneCamera) -> tuple[FloatArray, Any]:
-    """Bottom centres on the ground [n, 2], and which of them lie there."""
-    xy, valid = view.camera.ground(view.framing.frame_to_crop(found.bottom_centre_px()))
-    return xy, valid

@@ -1,8 +1,8 @@
-"""The optimiser of the convolutions: momentum, made as near to orthogonal as cheap (Muon).
+"""Muon, the optimiser of the convolutions: orthogonalised momentum.
 
-A gradient of a convolution is mostly the same few directions over and over; a step that is as long
-in every direction teaches the rare ones, too (Jordan et al. 2024, "Muon: an optimizer for hidden
-layers in neural networks"; the coefficients of the iteration are theirs).
+A few directions dominate the gradient of a convolution; a step of equal length in all directions
+learns the rare ones, too (Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural
+networks"; the coefficients of the iteration are theirs).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _A, _B, _C = 3.4445, -4.7750, 2.0315
 
 
 class Muon(torch.optim.Optimizer):
-    """For weights of two dimensions and more; those beyond the first are taken as one."""
+    """For weights of two or more dimensions; those beyond the first are flattened."""
 
     def __init__(self, params: Iterable[torch.Tensor], lr: float, decay: float) -> None:
         super().__init__(params, {"lr": lr, "decay": decay})
@@ -44,7 +44,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
-    """`matrix` [n, m] with all its singular values brought near one (0.7 to 1.2)."""
+    """`matrix` [n, m] with its singular values moved near one (0.7 to 1.2)."""
     wide = matrix.shape[0] <= matrix.shape[1]
     x = matrix if wide else matrix.T
     x = x / (x.norm() + 1e-7)

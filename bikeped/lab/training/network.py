@@ -1,13 +1,13 @@
-"""Our own small detector: a convolutional network of 700,000 weights.
+"""bikeped's small detector: a one-stage, anchor-free convolutional network of 700,000 weights.
 
-One stage, no anchors: three grids of strides 8, 16 and 32 pixels, each cell of which says how
-likely a road user of each class has its middle there and how far its four edges are from the cell's
-own centre. Only plain convolutions and ReLU, which every runtime has fast code for.
+Each cell of three grids of strides 8, 16 and 32 pixels predicts a score for each class and the
+distances of the box's four edges from the cell's centre. Only plain convolutions and ReLU, which
+all runtimes optimise.
 
-    stem    3 -> 16 -> 32 channels at 1/4 of the picture's size, where wheels are told from legs
+    stem    3 -> 16 -> 32 channels at 1/4 of the picture's size
     stages  64, 112, 160 channels at 1/8, 1/16, 1/32; each a few convolutions on half of the
-            channels, whose answers are all joined (as in CSP and ELAN networks)
-    neck    from coarse to fine, so that small figures are seen with what surrounds them
+            channels, all outputs concatenated (as in CSP and ELAN networks)
+    neck    from coarse to fine, to give small objects context
     heads   one convolution, then scores and edges
 """
 
@@ -21,7 +21,7 @@ import torch
 from torch import nn
 
 STRIDES = (8, 16, 32)
-#: A cell says `road user` this rarely before it has learnt anything (RetinaNet, section 4.1).
+#: Initial score of a cell (RetinaNet, section 4.1).
 _PRIOR = 0.01
 
 
@@ -38,7 +38,7 @@ class _Conv(nn.Module):
 
 
 class _Stage(nn.Module):
-    """`count` convolutions in a row on half of the channels; all of their answers are joined."""
+    """`count` convolutions in a row on half of the channels; all their outputs are concatenated."""
 
     def __init__(self, channels: int, count: int) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ class SmallNet(nn.Module):
 
 
 class ExportModule(nn.Module):
-    """The network with its answer in the layout `yolov8`: [n, 4 + classes, cells].
+    """The network with its output in the layout `yolov8`: [n, 4 + classes, cells].
 
     Rows: centre u, centre v, width, height in pixels of the input, then a score in 0..1 a class.
     """
@@ -126,7 +126,7 @@ class ExportModule(nn.Module):
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         score, edge = self.network(images)
-        # From the picture itself: the exported network serves every size.
+        # From the picture's own size: the exported network takes any.
         centre, stride = grid(images.shape[3], images.shape[2])
         low, high = edge[:, :2], edge[:, 2:]
         middle = centre.T[None] + (high - low) * (stride / 2)
@@ -152,7 +152,7 @@ def boxes_px(edge: torch.Tensor, centre: torch.Tensor, stride: torch.Tensor) -> 
 
 
 def multiply_adds(network: Any, width: int, height: int) -> int:
-    """Multiplications of the convolutions for one picture: what inference mostly costs."""
+    """Multiplications of all convolutions for one picture."""
     total = 0
 
     def count(module: Any, _: Any, answer: torch.Tensor) -> None:
@@ -170,9 +170,9 @@ def multiply_adds(network: Any, width: int, height: int) -> int:
 
 
 def shift_scores(network: SmallNet, score: Sequence[float], becomes: float) -> None:
-    """Moves every class's scores so that what was its `score` is `becomes`; their order stays.
+    """Shifts each class's scores, in log odds, so that its `score` becomes `becomes`.
 
-    So each class has the threshold that suits it, and all of them the one that is configured.
+    So one configured threshold stands for the best one of each class.
     """
     odds = torch.tensor([math.log(p / (1 - p)) for p in (*score, becomes)])
     with torch.no_grad():

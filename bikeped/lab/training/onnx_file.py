@@ -1,4 +1,4 @@
-"""An exported ONNX file: the facts in its metadata, and whether it answers as PyTorch does."""
+"""Metadata of an exported ONNX file, and comparison of its output with PyTorch's."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from bikeped.errors import DetectorError
 
-#: ONNX Runtime joins and reorders operations: answers differ in the last digits. Boxes are pixels.
+#: ONNX Runtime fuses and reorders operations, so outputs differ by rounding.
 _MOST_BOX_PX, _MOST_SCORE = 0.05, 1e-3
 
 
 def with_metadata(content: bytes, facts: dict[str, str]) -> bytes:
-    """An ONNX file's bytes with `facts` in its metadata, replacing what has their names."""
+    """An ONNX file's bytes with `facts` in its metadata, replacing entries of the same names."""
     import onnx
 
     model = onnx.load_model_from_string(content)
     kept = {entry.key: entry.value for entry in model.metadata_props} | facts
     onnx.helper.set_model_props(model, kept)
-    # The exporter's own path names tell about the machine and nothing about the model.
+    # Path names of the exporter say nothing about the model.
     for node in model.graph.node:
         node.ClearField("doc_string")
     data: bytes = model.SerializeToString()

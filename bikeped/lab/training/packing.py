@@ -1,16 +1,16 @@
-"""Many small windows in one picture to learn from: three times as many people for the same work.
+"""Packs small windows into squares: three times as many objects for the same work.
 
-A road user at ten metres is thirty pixels tall: in a window that a whole street fits into, nearly
-all of the work goes into asphalt. Here every window is cut just large enough for one object and
-some of what surrounds it, and windows are laid side by side on squares of one size, as mosaics are
-(Bochkovskiy et al. 2020, YOLOv4, section 3.3) but without making anybody smaller. The last part of
-the training sees plain windows again, so that the network knows streets as they are.
+A road user at ten metres is thirty pixels tall, so a window of a whole street is mostly background.
+Here each window is just large enough for one object and some of its surroundings, and windows are
+laid side by side on squares of one size, as in a mosaic (Bochkovskiy et al. 2020, YOLOv4, section
+3.3) but without downscaling. The last part of the training uses plain windows again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,9 +18,11 @@ from bikeped.lab.training.coco import FALSE_POSITIVE
 from bikeped.lab.training.crops import Crop, Cropper, CropSettings, Sample
 from bikeped.types import BoolArray, FloatArray
 
+T = TypeVar("T")
+
 BLOCK_PX = 64
-_NARROW = 0.6  #: share of the windows around things that are one block wide, the others two
-_TRIES = 12  #: objects that did not fit in a row, until what is left gets empty windows
+_NARROW = 0.6  #: share of the windows around fixtures that are one block wide, the others two
+_TRIES = 12  #: consecutive objects that did not fit; then empty windows fill the rest
 
 
 @dataclass(frozen=True)
@@ -28,15 +30,11 @@ class PackSettings:
     """How squares are filled."""
 
     side: int = 256  #: of a square, a multiple of `BLOCK_PX`
-    squares: int = 16  #: for each step
-    pool: int = 48  #: pictures that windows are cut from at any time
-    empty: float = 0.08  #: share of windows where some other picture has an object
-    #: Share of windows around signs, bollards and other things that are nobody, where the data
-    #: tell of them: they are what is taken for somebody.
-    furniture: float = 0.18
-    #: Share of windows around what a network took for somebody, where it was asked: those things,
-    #: leaves and shadows that do look like somebody.
-    mistaken: float = 0.1
+    squares: int = 16  #: per step
+    pool: int = 48  #: pictures that windows are cut from
+    empty: float = 0.08  #: share of windows where another picture has an object
+    furniture: float = 0.18  #: share of windows around fixtures and shadows
+    mistaken: float = 0.1  #: share of windows around false positives, where they were mined
     room: float = 1.25  #: side of a window, in longest sides of its object
     #: How often objects that need 1, 2, 3, 4 blocks are taken: the largest are the easiest.
     taken: tuple[float, ...] = (1.0, 1.0, 0.85, 0.65)
@@ -54,20 +52,22 @@ class _Window:
     blocks: int
 
 
+_Target = tuple[int, int]  #: index of its sample in the pool, and index there
+
+
 @dataclass(frozen=True)
 class SamplingPool:
-    """What a window may be about, each as number of its picture in the pool and number there:
-    objects by class, things by kind, and what a network took for somebody."""
+    """What windows can be cut around: objects by class, fixtures by kind, false positives."""
 
-    by_class: list[list[tuple[int, int]]]
-    things: dict[str, list[tuple[int, int]]]
-    mistakes: list[tuple[int, int]]
+    by_class: list[list[_Target]]
+    furniture: dict[str, list[_Target]]
+    false_positives: list[_Target]
 
     @classmethod
     def of(cls, pool: Sequence[Sample]) -> SamplingPool:
-        things = _by_thing(pool)
-        mistakes = things.pop(FALSE_POSITIVE, [])
-        return cls(_by_class(pool), things, mistakes)
+        furniture = _by_kind(pool)
+        false_positives = furniture.pop(FALSE_POSITIVE, [])
+        return cls(_by_class(pool), furniture, false_positives)
 
 
 class Packer:
@@ -83,12 +83,12 @@ class Packer:
         side = self._settings.side // BLOCK_PX
         free = np.ones((count, side, side), np.bool_)
         placed: list[list[tuple[int, int, Crop]]] = [[] for _ in range(count)]
-        lots = SamplingPool.of(pool)
+        targets = SamplingPool.of(pool)
         misses = 0
         while free.any():
-            pick = self._choose_window(pool, lots, random) if misses < _TRIES else None
+            pick = self._choose_window(pool, targets, random) if misses < _TRIES else None
             if pick is None:
-                pick = _Window(pool[int(random.integers(len(pool)))], np.zeros(0), 1.0, 1)
+                pick = _Window(_one_of(pool, random), np.zeros(0), 1.0, 1)
             spot = first_fit(free, pick.blocks)
             if spot is None:
                 misses += 1
@@ -100,19 +100,21 @@ class Packer:
         return [_assembled(tiles, self._settings.side) for tiles in placed]
 
     def _choose_window(
-        self, pool: Sequence[Sample], lots: SamplingPool, random: np.random.Generator
+        self, pool: Sequence[Sample], targets: SamplingPool, random: np.random.Generator
     ) -> _Window | None:
-        """First the class, then one of its objects; None for a window with nobody in its middle."""
+        """A window around a random target; None for one at another picture's object."""
         settings = self._settings
-        if lots.mistakes and random.random() < settings.mistaken:
-            number, index = lots.mistakes[int(random.integers(len(lots.mistakes)))]
+        if targets.false_positives and random.random() < settings.mistaken:
+            number, index = targets.false_positives[
+                int(random.integers(len(targets.false_positives)))
+            ]
             return self._object_window(pool[number], pool[number].false_positive_px[index], random)
         what = random.random() - settings.empty
         if what < 0:
             return None
-        if what < settings.furniture and lots.things:
-            return self._furniture_window(pool, lots.things, random)
-        by_class = lots.by_class
+        if what < settings.furniture and targets.furniture:
+            return self._furniture_window(pool, targets.furniture, random)
+        by_class = targets.by_class
         if not any(by_class):
             return None
         share = random.random() - np.cumsum(settings.classes)
@@ -122,17 +124,17 @@ class Packer:
             kind += int(random.integers(len(by_class) - rest))
         if kind >= len(by_class) or not by_class[kind]:
             kind = int(random.choice([k for k, found in enumerate(by_class) if found]))
-        number, index = by_class[kind][int(random.integers(len(by_class[kind])))]
+        number, index = _one_of(by_class[kind], random)
         pick = self._object_window(pool[number], pool[number].box_px[index], random)
         likely = settings.taken[min(pick.blocks, len(settings.taken)) - 1]
         if random.random() >= likely:
-            return self._choose_window(pool, lots, random)
+            return self._choose_window(pool, targets, random)
         return pick
 
     def _object_window(
         self, sample: Sample, box: FloatArray, random: np.random.Generator
     ) -> _Window:
-        """A window that holds `box` [4] and a little of what surrounds it."""
+        """A window around `box` [4] with a margin."""
         scale = float(random.uniform(*self._scale))
         longest = float((box[2:] - box[:2]).max()) * scale * self._settings.room
         blocks = int(np.clip(np.ceil(longest / BLOCK_PX), 1, self._settings.side // BLOCK_PX))
@@ -141,13 +143,12 @@ class Packer:
     def _furniture_window(
         self,
         pool: Sequence[Sample],
-        things: dict[str, list[tuple[int, int]]],
+        things: dict[str, list[_Target]],
         random: np.random.Generator,
     ) -> _Window:
-        """A window about any spot of a thing: first the kind of thing, then one of them."""
-        kinds = sorted(things)
-        kind = kinds[int(random.integers(len(kinds)))]
-        number, index = things[kind][int(random.integers(len(things[kind])))]
+        """A window at a random spot of a fixture: first the kind, then one of it."""
+        kind = _one_of(sorted(things), random)
+        number, index = _one_of(things[kind], random)
         box = pool[number].furniture_px[kind][index]
         spot = box[:2] + random.uniform(0, 1, 2) * (box[2:] - box[:2])
         blocks = 1 if random.random() < _NARROW else min(2, self._settings.side // BLOCK_PX)
@@ -159,6 +160,10 @@ class Packer:
         return self._cropper(
             pick.sample, random, window=(side, side), around=pick.box_px, scale=pick.scale
         )
+
+
+def _one_of(choices: Sequence[T], random: np.random.Generator) -> T:
+    return choices[int(random.integers(len(choices)))]
 
 
 def first_fit(free: BoolArray, blocks: int) -> tuple[int, int, int] | None:
@@ -175,20 +180,20 @@ def first_fit(free: BoolArray, blocks: int) -> tuple[int, int, int] | None:
     return int(square), int(row), int(column)
 
 
-def _by_class(pool: Sequence[Sample]) -> list[list[tuple[int, int]]]:
-    """For every class: picture of the pool and number there of each of its objects."""
+def _by_class(pool: Sequence[Sample]) -> list[list[_Target]]:
+    """Index of the sample and index there of every object, by class."""
     most = max((int(v.class_id.max()) for v in pool if len(v.class_id)), default=-1)
-    found: list[list[tuple[int, int]]] = [[] for _ in range(most + 1)]
+    found: list[list[_Target]] = [[] for _ in range(most + 1)]
     for number, sample in enumerate(pool):
         for index in np.flatnonzero(sample.crowd == 0).tolist():
-            lots = [(number, index)] * sample.sampling_weight(index)
-            found[int(sample.class_id[index])].extend(lots)
+            weighted = [(number, index)] * sample.sampling_weight(index)
+            found[int(sample.class_id[index])].extend(weighted)
     return found
 
 
-def _by_thing(pool: Sequence[Sample]) -> dict[str, list[tuple[int, int]]]:
-    """For every kind of thing: picture of the pool and number there of each of them."""
-    found: dict[str, list[tuple[int, int]]] = {}
+def _by_kind(pool: Sequence[Sample]) -> dict[str, list[_Target]]:
+    """Index of the sample and index there of every fixture, by kind."""
+    found: dict[str, list[_Target]] = {}
     for number, sample in enumerate(pool):
         for what, boxes in sample.furniture_px.items():
             found.setdefault(what, []).extend((number, index) for index in range(len(boxes)))

@@ -1,10 +1,9 @@
-"""The same network in whole numbers of eight bits: 0.7 of the time on a processor without a GPU.
+"""Static quantisation of the small network to eight bits: 0.7 of the time on a processor.
 
-Weights and what passes between the layers are rounded to 256 steps, whose sizes are taken from what
-the network answers to real pictures (Jacob et al. 2018, "Quantization and training of neural
-networks for efficient integer-arithmetic-only inference"; static, a scale for each filter). The
-first layer is left as it is, whose three channels whole numbers make no quicker, and so are scores
-and edges, which are little work: a box is asked for to a part of a pixel.
+Weights (per channel) and activations become eight-bit integers, calibrated on pictures (Jacob et
+al. 2018, "Quantization and training of neural networks for efficient integer-arithmetic-only
+inference"). The first layer stays in floating point, as its three channels gain nothing, and so do
+scores and edges, which must be exact and take little time.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from bikeped.files import write_whole
 from bikeped.lab.training.coco import CocoData, read_picture
 from bikeped.types import Float32Array
 
-CALIBRATION_IMAGES = 64  #: are enough to take the steps from
+CALIBRATION_IMAGES = 64  #: enough to calibrate with
 _INPUT = "images"
-#: How the names of the operations begin that are rounded, as `export` writes them. Not the joining
-#: of the answers: edges would be rounded to a twentieth of a cell.
+#: Names of the quantised operations, as `export` writes them. The last concatenation is not one:
+#: edges would be rounded to a twentieth of a cell.
 _ROUNDED = re.compile(
     r"/network/(stem/stem\.[12]/|stages\.|lateral\.|merge\.|heads\.\d+/trunk/|Resize|Add)"
 )
@@ -38,8 +37,8 @@ _OPERATIONS = ["Conv", "Relu", "Concat", "Add", "Slice", "Resize"]
 def calibration_images(
     data: CocoData, size: tuple[int, int], count: int = CALIBRATION_IMAGES
 ) -> Iterator[Float32Array]:
-    """About `count` pictures of `data`, evenly spread, as a network of input `size` (width, height)
-    is shown them: [1, 3, h, w], 0..1. Raises DataSetError for one that cannot be read."""
+    """About `count` evenly spread pictures of `data`, preprocessed for a network of input `size`
+    (width, height): [1, 3, h, w], 0..1. Raises DataSetError for one that cannot be read."""
     width, height = size
     show = Preprocessor("ultralytics", np.zeros((1, 3, height, width), np.float32))
     for image in data.images[:: max(1, len(data.images) // count)]:
@@ -48,12 +47,12 @@ def calibration_images(
 
 
 def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
-    """Writes `model`, an ONNX file of the small network, in eight bits to `out`; returns its bytes.
+    """Quantises `model`, an ONNX file of the small network, to `out`; returns the size in bytes.
 
-    `pictures` as `calibration_images` has them: the mean of what each of them needs is within the
-    steps, what is beyond is cut off. Weights take seven of the eight bits, for with eight the sums
-    of two products overflow on processors with AVX2 only (ONNX Runtime, "Quantize ONNX models",
-    `reduce_range`). Raises DetectorError where there is no picture, or the model is none of ours.
+    `pictures` as `calibration_images` gives them: the ranges are means over them, values beyond are
+    clipped. Weights take seven of the eight bits, for with eight the sums of two products overflow
+    on processors with AVX2 only (ONNX Runtime, "Quantize ONNX models", `reduce_range`). Raises
+    DetectorError where there is no picture, or the model is another one.
     """
     import onnx
     from onnxruntime.quantization import (
@@ -81,7 +80,7 @@ def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
     reader = Reader()
     log = logging.getLogger()
     level = log.level
-    log.setLevel(logging.ERROR)  # advice about a step that the exporter has done already
+    log.setLevel(logging.ERROR)  # advice about a preprocessing that the exporter has done
     try:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "int8.onnx"
@@ -96,15 +95,14 @@ def quantise(model: Path, pictures: Iterable[Float32Array], out: Path) -> int:
                 reduce_range=True,
                 op_types_to_quantize=_OPERATIONS,
                 nodes_to_exclude=kept,
-                # The steps are as wide as a usual picture needs: one glaring picture would make
-                # them coarser for all others.
+                # Mean ranges: the extremes of one glaring picture would coarsen all others.
                 extra_options={"CalibMovingAverage": True},
             )
             content = file.read_bytes()
     except ValueError as error:
         if reader.count:
             raise
-        raise DetectorError(f"{model}: no picture to take the steps' sizes from") from error
+        raise DetectorError(f"{model}: no picture to calibrate with; name a data set") from error
     finally:
         log.setLevel(level)
     write_whole(out, content)

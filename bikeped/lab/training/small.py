@@ -1,9 +1,9 @@
-"""Trains our own small network on a data set and leaves weights, ONNX and what was done."""
+"""Trains the small network and writes its weights and the ONNX model."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +13,22 @@ from bikeped.lab.training.coco import CocoData
 from bikeped.lab.training.crops import CropSettings
 from bikeped.lab.training.device import resolve_device, supports_bfloat16
 from bikeped.lab.training.export import export_network
-from bikeped.lab.training.fit import FitSettings, fit, settings_as_dict
+from bikeped.lab.training.fit import FitSettings, fit
 from bikeped.lab.training.hard_negative_mining import MiningSettings
 from bikeped.lab.training.weights import SmallDetector, save_weights
 
 
 @dataclass(frozen=True)
 class SmallTrainSettings:
-    """What is asked for; the rest is `FitSettings`' own."""
+    """Options of the command; the rest are `FitSettings`' defaults."""
 
     steps: int = 6000
-    pictures: int = 8  #: read for each step
+    pictures: int = 8  #: per step
     seed: int = 0
     device: str = "auto"
     crops: CropSettings = field(default_factory=CropSettings)
     mining: MiningSettings = field(default_factory=MiningSettings)
-    facts: dict[str, Any] = field(default_factory=dict)  #: travel in the weights and the model
+    facts: dict[str, Any] = field(default_factory=dict)  #: recorded in weights and model
 
 
 def train_small(
@@ -38,7 +38,7 @@ def train_small(
     progress: Callable[[int], None] = lambda done: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Writes `out`/weights.pt and `out`/model.onnx; returns what was done, for JSON.
+    """Writes `out`/weights.pt and `out`/model.onnx; returns a summary for JSON.
 
     Raises DataSetError and DetectorError.
     """
@@ -75,7 +75,7 @@ def train_small(
         "seconds": round(fitted.seconds, 1),
         "device": device,
         "torch": torch.__version__,
-        "settings": settings_as_dict(settings),
+        "settings": asdict(settings),
         "mistakes": fitted.mistakes,
         "losses": fitted.losses,
     }

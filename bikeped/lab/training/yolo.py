@@ -1,9 +1,8 @@
-"""A real YOLO (YOLOv9) through LibreYOLO, a library under the MIT licence.
+"""Trains and exports YOLOv9 through LibreYOLO (MIT licence).
 
-The library reads COCO's format itself; what is done here is to hand it the data as bikeped read
-them, to have it letterbox as `bikeped.detection` does (picture centred), and to export with the
-facts that `bikeped.detection` reads. Nothing is downloaded: the network starts from the weights
-that are named, or from scratch.
+The library gets the data as bikeped reads them, letterboxes as `bikeped.detection` does (picture
+centred), and exports with the metadata that `bikeped.detection` reads. Nothing is downloaded: the
+training starts from the named weights, or from scratch.
 """
 
 from __future__ import annotations
@@ -14,23 +13,25 @@ import tempfile
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from bikeped.errors import DataSetError, DetectorError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.training.coco import CocoData, CocoImage, write_annotations
 from bikeped.lab.training.onnx_file import compare, with_metadata
 
-_VALIDATION_SHARE = 20  #: one picture in so many, where no validation set is named
+_VALIDATION_SHARE = 20  #: one picture in this many, without a validation set
 _OPSET = 17
 
 
 @dataclass(frozen=True)
 class YoloTrainSettings:
-    """What is asked of the library."""
+    """Options of the training."""
 
     network: str = "yolov9-s"  #: yolov9-t, -s, -m, -c
     size: int = 1280
@@ -45,10 +46,10 @@ class YoloTrainSettings:
 def train_yolo(
     data: CocoData, validation: CocoData | None, out: Path, order: YoloTrainSettings
 ) -> dict[str, Any]:
-    """Trains and exports; writes `out`/weights.pt and `out`/model.onnx, returns what was done.
+    """Writes `out`/weights.pt and `out`/model.onnx; returns a summary for JSON.
 
-    The epoch that does best on `validation` is kept; without one, a twentieth of `data` is held
-    back for it. Raises DataSetError and DetectorError.
+    Keeps the epoch that is best on `validation`, by default a held-out twentieth of `data`. Raises
+    DataSetError and DetectorError.
     """
     if order.size % 32:
         raise DataSetError(f"--size {order.size}: must be a multiple of 32; choose another")
@@ -77,7 +78,7 @@ def train_yolo(
     order_json = asdict(order) | {"weights": None if order.weights is None else str(order.weights)}
     return {
         "network": order.network,
-        "library": f"libreyolo {_version('libreyolo')}",
+        "library": f"libreyolo {version('libreyolo')}",
         "data": str(data.source),
         "data_sha256": data.sha256,
         "pictures": len(data.images),
@@ -89,17 +90,16 @@ def train_yolo(
         "model_bytes": exported["bytes"],
         "seconds": round(time.monotonic() - began, 1),
         "device": order.device,
-        "torch": _version("torch"),
+        "torch": version("torch"),
         "settings": order_json,
         "results": {k: v for k, v in answer.items() if isinstance(v, int | float | str)},
     }
 
 
 def export_yolo(weights: Path, out: Path, size: int) -> dict[str, Any]:
-    """Exports weights that LibreYOLO trained, for a square input; what was written, for JSON.
+    """Exports LibreYOLO's weights for a square input and compares the output with PyTorch's.
 
-    The library itself compares nothing: the answer is held against PyTorch's here. Raises
-    DetectorError.
+    Returns a summary for JSON. Raises DetectorError.
     """
     model = _load(weights, None, "cpu")
     names = [str(model.names[i]) for i in range(len(model.names))]
@@ -137,7 +137,7 @@ def export_yolo(weights: Path, out: Path, size: int) -> dict[str, Any]:
 
 
 def write_data(data: CocoData, validation: CocoData | None, folder: Path, seed: int) -> Path:
-    """Writes the library's description of the data (pictures stay where they are); its path."""
+    """Writes the library's data.yaml, which refers to the pictures where they are; its path."""
     images = list(data.images)
     if validation is None:
         if len(images) < 2:
@@ -157,17 +157,13 @@ def write_data(data: CocoData, validation: CocoData | None, folder: Path, seed: 
         parts = [(data, images), (validation, list(validation.images))]
     shutil.rmtree(folder, ignore_errors=True)
     make_folder(folder)
-    lines = [f"path: {_quoted(folder.resolve())}"]
+    description: dict[str, Any] = {"path": str(folder.resolve()), "annotations": {}}
     for name, (source, chosen) in zip(("train", "val"), parts, strict=True):
         _write_part(folder / f"{name}.json", source, chosen)
-        lines.append(f"{name}: {_quoted(_root(source))}")
-    lines.append("annotations:")
-    lines += [
-        f"  {name}: {_quoted(folder.resolve() / f'{name}.json')}" for name in ("train", "val")
-    ]
-    lines += [f"nc: {len(data.categories)}", "names:"]
-    lines += [f"  {i}: {_quoted(name)}" for i, name in enumerate(data.categories.values())]
-    write_whole(folder / "data.yaml", "\n".join(lines) + "\n")
+        description[name] = str(_root(source))
+        description["annotations"][name] = str(folder.resolve() / f"{name}.json")
+    description |= {"nc": len(data.categories), "names": dict(enumerate(data.categories.values()))}
+    write_whole(folder / "data.yaml", yaml.safe_dump(description, allow_unicode=True))
     return folder / "data.yaml"
 
 
@@ -199,17 +195,12 @@ def _root(data: CocoData) -> Path:
     return Path(*image.path.resolve().parts[: -len(Path(image.file_name).parts)])
 
 
-def _quoted(value: object) -> str:
-    """A YAML string in single quotes."""
-    return "'" + str(value).replace("'", "''") + "'"
-
-
 def _load(weights: Path | None, size: str | None, device: str) -> Any:
     """The library's model: from `weights`, or a fresh one of `size`."""
     require("libreyolo")
     library = importlib.import_module("libreyolo")
     if weights is not None and not weights.is_file():
-        # The library would look for it on the network.
+        # The library would try to download it.
         raise DetectorError(f"{weights}: does not exist; name a file of weights")
     try:
         if weights is None:
@@ -229,12 +220,6 @@ def _torch_answer(model: Any, picture: Any) -> Any:
     network = model.model.eval()
     with torch.no_grad():
         answer = network(torch.from_numpy(picture))
-    while not hasattr(answer, "shape"):  # the library answers a table of tensors
+    while not hasattr(answer, "shape"):  # the library returns nested tensors
         answer = answer["predictions"] if isinstance(answer, dict) else answer[0]
     return answer.numpy()
-
-
-def _version(library: str) -> str:
-    from importlib.metadata import version
-
-    return version(library)

@@ -111,7 +111,10 @@ def test_training_looks_when_it_is_told_to_and_learns_the_same_each_time(data):
     )
     first = fit(data, settings, say=lines.append)
     assert len(first.mistakes) == 2
-    assert [line.split(",")[0] for line in lines if "mistakes" in line] == ["step 2", "step 3"]
+    assert [line.split(",")[0] for line in lines if "false positives" in line] == [
+        "step 2",
+        "step 3",
+    ]
     again = fit(data, settings)
     assert again.mistakes == first.mistakes
     for key, value in first.network.state_dict().items():
