@@ -1,6 +1,6 @@
 """Pictures for people: the camera's view with what was found, and a bird's-eye radar.
 
-Pure functions over the stage types; only `VideoWriter` touches the disk.
+Pure functions over the stage types; only `VideoWriter` writes to disk.
 """
 
 from bikeped.overlay.camera_view import draw_banner, draw_overlay

@@ -1,4 +1,4 @@
-"""The camera's picture with boxes, tracks, the pair that was judged, and the state in words."""
+"""The camera's picture with boxes, tracks, the decision's pair, and the state in words."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from bikeped.overlay.drawing import (
     Rect,
     Rgb,
     dashed,
+    draw_tag,
     draw_text,
     fill_rect,
     hatch,
@@ -29,7 +30,7 @@ from bikeped.types import FloatArray, ImageArray, Kind
 
 #: A coasting track is drawn as a ring of this radius lying on the ground.
 RING_M = 0.6
-#: Coasting tracks beyond this are dots on the horizon: their labels would only hide others.
+#: Coasting tracks beyond this are not drawn: their labels at the horizon would hide others.
 UNSEEN_RANGE_M = 40.0
 
 
@@ -60,7 +61,7 @@ def draw_overlay(
     rows = data.pair_rows()
     ends = _pair_points(data, rows, boxes, scale, ground_to_frame)
     if ends is not None:
-        _draw_pair(image, ends, _pair_colour(data), size)
+        _draw_pair(image, ends, data.pair_colour, size)
     _draw_unseen(image, data, scale, ground_to_frame, size, labels)
     _draw_boxes(image, data, boxes, rows, size, labels)
     _draw_distance(image, data, ends, taken, bounds, size)
@@ -98,7 +99,7 @@ def draw_banner(image: ImageArray, data: OverlayData, rect: Rect) -> None:
         left = x0 + wide + pad
         rule = data.decision.state.name
         if rule != name and name != "OFF":
-            # The light holds ALERT for a while; say so instead of seeming to contradict the rule.
+            # The light holds ALERT for a while: show the rule's present state too.
             note = f"rule now: {rule}"
             room = text_size(note, small)[0] + pad
             draw_text(
@@ -113,7 +114,7 @@ def draw_banner(image: ImageArray, data: OverlayData, rect: Rect) -> None:
 
 
 def _reason(data: OverlayData) -> str:
-    """The sentence without the state's name in front, which stands beside it already."""
+    """The sentence without the state's name, which is shown beside it."""
     head, colon, rest = data.sentence.partition(": ")
     if not colon or head != data.decision.state.name:
         return data.sentence
@@ -121,16 +122,12 @@ def _reason(data: OverlayData) -> str:
 
 
 def _text_height(w: int, h: int) -> int:
-    """Capitals' height: readable in a 432-line clip, not shouting at 1080 lines."""
+    """Height of capitals in pixels: readable in a 432-line clip, not too large at 1080 lines."""
     return int(np.clip(round(min(h, w * 9 / 16) / 58), 9, 22))
 
 
 def _banner_height(w: int, h: int) -> int:
     return int(np.clip(round(min(h, w * 9 / 16) * 0.085), 30, 96))
-
-
-def _pair_colour(data: OverlayData) -> Rgb:
-    return SIGNAL_COLOUR["ALERT" if data.alerting else "WARNING"]
 
 
 def _draw_boxes(
@@ -146,15 +143,15 @@ def _draw_boxes(
     row_of = {int(d): i for i, d in enumerate(tracks.detection) if d >= 0}
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     line = max(round(size / 6), 2)
-    found: list[tuple[bool, str, Rect, Rgb]] = []
+    entries: list[tuple[bool, str, Rect, Rgb]] = []
     for d in np.argsort(-area, kind="stable").tolist():
         x0, y0, x1, y1 = boxes[d].tolist()
         box: Rect = (x0, y0, x1, y1)
         row = row_of.get(d)
         kind = Kind(int(data.detections.kind[d]))
         colour = KIND_COLOUR[kind]
-        judged = row is not None and rows is not None and row in rows
-        if judged and data.alerting:
+        paired = row is not None and rows is not None and row in rows
+        if paired and data.alerting:
             halo = line * 2 + 1
             wide: Rect = (x0 - halo, y0 - halo, x1 + halo, y1 + halo)
             outline(image, wide, PAPER, line + 3)
@@ -168,10 +165,10 @@ def _draw_boxes(
         else:
             speed = float(np.hypot(*tracks.velocity_mps[row]))
             text = f"{Kind(int(tracks.kind[row])).label} {tracks.id[row]}  {speed:.1f} m/s"
-        found.append((judged, text, box, colour))
-    found.reverse()
-    found.sort(key=lambda item: not item[0])
-    labels[:0] = [(text, box, colour) for _, text, box, colour in found]
+        entries.append((paired, text, box, colour))
+    entries.reverse()
+    entries.sort(key=lambda item: not item[0])
+    labels[:0] = [(text, box, colour) for _, text, box, colour in entries]
 
 
 def _draw_unseen(
@@ -182,7 +179,7 @@ def _draw_unseen(
     size: int,
     labels: list[tuple[str, Rect, Rgb]],
 ) -> None:
-    """A dashed ring on the ground where each track without a detection is believed to be."""
+    """A dashed ring on the ground at the predicted place of each track without a detection."""
     if ground_to_frame is None:
         return
     tracks = data.tracks
@@ -218,15 +215,15 @@ def _pair_points(
         return None
     tracks = data.tracks
     if ground_to_frame is not None:
-        part = np.linspace(0, 1, 25)[:, None]
-        way = tracks.xy_m[rows[0]] * (1 - part) + tracks.xy_m[rows[1]] * part
-        line = ground_to_frame(way) * scale
+        share = np.linspace(0, 1, 25)[:, None]
+        xy_m = tracks.xy_m[rows[0]] * (1 - share) + tracks.xy_m[rows[1]] * share
+        line = ground_to_frame(xy_m) * scale
         return line if np.isfinite(line).all(axis=1).sum() > 1 else None
-    found = tracks.detection[list(rows)]
-    if (found < 0).any():
+    detection = tracks.detection[list(rows)]
+    if (detection < 0).any():
         return None
-    low = boxes[found]
-    return np.stack([(low[:, 0] + low[:, 2]) / 2, low[:, 3]], axis=1)
+    pair = boxes[detection]
+    return np.stack([(pair[:, 0] + pair[:, 2]) / 2, pair[:, 3]], axis=1)
 
 
 def _draw_pair(image: ImageArray, line: FloatArray, colour: Rgb, size: int) -> None:
@@ -254,14 +251,9 @@ def _draw_distance(
     u, v = shown[inside][int(inside.sum()) // 2]
     height = size + 1
     text = f"{pair.distance_m:.1f} m"
-    w, h = text_size(text, height, True)[0] + height, height * 2
-    rect: Rect = (u - w / 2, v - h / 2, u + w / 2, v + h / 2)
-    colour = _pair_colour(data)
-    fill_rect(image, (rect[0] - 1, rect[1] - 1, rect[2] + 1, rect[3] + 1), INK)
-    fill_rect(image, rect, colour)
-    ink = readable_on(colour)
-    draw_text(image, text, (u, v - height / 2), height, ink, bold=True, anchor="centre")
-    taken.append(rect)
+    half = (text_size(text, height, True)[0] + height) / 2 + 1
+    fill_rect(image, (u - half, v - height - 1, u + half, v + height + 1), INK)
+    taken.append(draw_tag(image, text, (u, v), height, data.pair_colour))
 
 
 def _draw_label(

@@ -1,7 +1,7 @@
 """Palette and drawing primitives on RGB pictures (uint8 [h, w, 3]), changed in place.
 
 The kind colours are from Okabe and Ito's palette, which people with any colour vision tell apart;
-the state colours are the light's own. Neither ever stands without its word.
+the state colours are the light's own. Neither is ever used without its word.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SIGNAL_COLOUR: dict[str, Rgb] = {
 INK: Rgb = (16, 20, 26)
 PAPER: Rgb = (244, 246, 248)
 
-_SHIFT = 4  # cv2 takes fixed-point pixels: sixteenths keep moving lines from trembling
+_SHIFT = 4  # fractional bits of cv2's fixed-point pixels: sixteenths avoid jitter
 _FAR = 1e5  # beyond this a coordinate overflows OpenCV's fixed-point arithmetic
 
 
@@ -48,7 +48,7 @@ def shade(colour: Rgb, factor: float) -> Rgb:
 
 
 def readable_on(colour: Rgb) -> Rgb:
-    """Dark or light text, whichever stands out on `colour`."""
+    """INK or PAPER, whichever has the higher contrast on `colour`."""
     luma = 0.299 * colour[0] + 0.587 * colour[1] + 0.114 * colour[2]
     return INK if luma > 125 else PAPER
 
@@ -59,7 +59,7 @@ def _font(bold: bool) -> int:
 
 @functools.lru_cache(maxsize=256)
 def _scale(height: int, bold: bool) -> float:
-    """Font scale for capitals that are `height` pixels tall, whichever OpenCV draws them."""
+    """Font scale at which capitals are `height` pixels tall."""
     (_, tall), _ = cv2.getTextSize("H", _font(bold), 4.0, 1)
     return 4.0 * height / max(tall, 1)
 
@@ -114,12 +114,9 @@ def wrap_text(text: str, height: int, width: float, lines: int) -> list[str]:
 
 def fill_rect(image: ImageArray, rect: Rect, colour: Rgb, opacity: float = 1.0) -> None:
     """A filled rectangle, see-through when `opacity` is below 1, clipped to the picture."""
-    h, w = image.shape[:2]
-    x0, y0 = max(round(rect[0]), 0), max(round(rect[1]), 0)
-    x1, y1 = min(round(rect[2]), w), min(round(rect[3]), h)
-    if x1 <= x0 or y1 <= y0:
+    part = image[_clipped(image, rect)]
+    if part.size == 0:
         return
-    part = image[y0:y1, x0:x1]
     if opacity >= 1:
         part[:] = colour
         return
@@ -185,11 +182,11 @@ def arrow(
     head_px: float,
 ) -> None:
     """A line from `tail` to `tip` with a filled head."""
-    way = np.asarray(tip, dtype=np.float64) - tail
-    length = float(np.hypot(*way))
+    direction = np.asarray(tip, dtype=np.float64) - tail
+    length = float(np.hypot(*direction))
     if not length > 1e-6:
         return
-    along = way / length
+    along = direction / length
     across = np.array([-along[1], along[0]])
     neck = tip - along * min(head_px, length)
     polyline(image, np.stack([tail, neck]), colour, thickness)
@@ -199,15 +196,11 @@ def arrow(
 
 
 def hatch(image: ImageArray, rect: Rect, a: Rgb, b: Rgb, width_px: int) -> None:
-    """Diagonal stripes of two colours: no single lamp or coloured panel looks like it."""
-    h, w = image.shape[:2]
-    x0, y0 = max(round(rect[0]), 0), max(round(rect[1]), 0)
-    x1, y1 = min(round(rect[2]), w), min(round(rect[3]), h)
-    if x1 <= x0 or y1 <= y0:
-        return
-    y, x = np.mgrid[y0:y1, x0:x1]
+    """Diagonal stripes of two colours, unlike any state's colour."""
+    area = _clipped(image, rect)
+    y, x = np.mgrid[area]
     stripe = ((x + y) // max(width_px, 1)) % 2 == 0
-    image[y0:y1, x0:x1] = np.where(stripe[..., None], np.array(a, np.uint8), np.array(b, np.uint8))
+    image[area] = np.where(stripe[..., None], np.array(a, np.uint8), np.array(b, np.uint8))
 
 
 def overlap(a: Rect, b: Rect) -> float:
@@ -251,6 +244,26 @@ def place_label(
         if cost < least:
             best, least = spot, cost
     return best
+
+
+def draw_tag(
+    image: ImageArray, text: str, centre: tuple[float, float], height: int, colour: Rgb
+) -> Rect:
+    """Bold text on a filled rectangle around `centre`; returns the rectangle."""
+    u, v = centre
+    half = (text_size(text, height, True)[0] + height) / 2
+    rect: Rect = (u - half, v - height, u + half, v + height)
+    fill_rect(image, rect, colour)
+    ink = readable_on(colour)
+    draw_text(image, text, (u, v - height / 2), height, ink, bold=True, anchor="centre")
+    return rect
+
+
+def _clipped(image: ImageArray, rect: Rect) -> tuple[slice, slice]:
+    """Rows and columns of `rect` inside the picture."""
+    h, w = image.shape[:2]
+    x0, y0 = max(round(rect[0]), 0), max(round(rect[1]), 0)
+    return slice(y0, max(min(round(rect[3]), h), y0)), slice(x0, max(min(round(rect[2]), w), x0))
 
 
 def _fixed(points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:

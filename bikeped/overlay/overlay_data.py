@@ -1,4 +1,4 @@
-"""All that a picture of one frame shows, and the way from the ground into the picture."""
+"""What a picture of one frame shows, and the projection from the ground into the picture."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 
 from bikeped.faults import fault_texts
 from bikeped.geometry import Framing, GroundCamera
+from bikeped.overlay.drawing import SIGNAL_COLOUR, Rgb
 from bikeped.types import Decision, Detections, FloatArray, Signal, State, Tracks
 
-#: Camera ground positions [n, 2] in metres to frame pixels [n, 2]; NaN where the lens is blind.
+#: Camera ground positions [n, 2] in metres to frame pixels [n, 2]; NaN where the lens cannot see.
 GroundToFrame = Callable[[FloatArray], FloatArray]
 
 
@@ -43,8 +44,13 @@ class OverlayData:
 
     @property
     def alerting(self) -> bool:
-        """Whether the pair of the decision is to stand out."""
+        """Whether to highlight the decision's pair."""
         return self.decision.state is State.ALERT and self.shown_name != "FAULT"
+
+    @property
+    def pair_colour(self) -> Rgb:
+        """Colour of the decision's pair."""
+        return SIGNAL_COLOUR["ALERT" if self.alerting else "WARNING"]
 
     def pair_rows(self) -> tuple[int, int] | None:
         """Rows of the decision's cyclist and pedestrian in `tracks`; None when either is gone."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,17 +18,17 @@ from bikeped.overlay.drawing import (
     arrow,
     circle,
     dashed,
+    draw_tag,
     draw_text,
     fill_rect,
     place_label,
     polygon,
     polyline,
-    readable_on,
     shade,
     text_size,
 )
 from bikeped.overlay.overlay_data import OverlayData
-from bikeped.types import FloatArray, ImageArray, Kind
+from bikeped.types import BoolArray, FloatArray, ImageArray, Kind
 
 RING_STEP_M = 5.0
 #: An arrow shows where its object will be after this long.
@@ -94,7 +93,7 @@ def draw_radar(
     taken: list[Rect] = []
     paired = rows if rows is not None and near[list(rows)].all() else None
 
-    _draw_trails(image, frame, data.history, {int(i) for i in tracks.id[near]}, data)
+    _draw_trails(image, frame, data, near)
     if paired is not None:
         _draw_pair(image, frame, data, paired)
     labels: list[tuple[bool, int, FloatArray]] = []
@@ -105,8 +104,8 @@ def draw_radar(
             rim = frame.pixels(tracks.xy_m[row] / max(reach[row], 1e-9) * range_m)
             circle(image, rim, text * 0.35, shade(KIND_COLOUR[kind], 0.7))
             continue
-        judged = rows is not None and row in rows
-        if judged and data.alerting:
+        in_pair = rows is not None and row in rows
+        if in_pair and data.alerting:
             circle(image, at, text * 1.45, SIGNAL_COLOUR["ALERT"], max(round(text / 4), 2))
         velocity = tracks.velocity_mps[row]
         if np.hypot(*velocity) > 0.3:
@@ -114,7 +113,7 @@ def draw_radar(
             arrow(image, at, tip, KIND_COLOUR[kind], max(round(text / 7), 1), text * 0.6)
         heading = math.atan2(velocity[1], velocity[0])
         _symbol(image, kind, at, text * 0.62, heading, unseen=bool(tracks.detection[row] < 0))
-        labels.append((judged, row, at))
+        labels.append((in_pair, row, at))
     if paired is not None:
         _draw_distance(image, frame, data, paired, text, taken)
     labels.sort(key=lambda item: not item[0])
@@ -130,7 +129,7 @@ def _text_height(size: tuple[int, int]) -> int:
 
 @functools.lru_cache(maxsize=8)
 def _base(frame: RadarProjection, fov_deg: float, heading_deg: float) -> ImageArray:
-    """Rings, spokes, wedge and camera: the same in every frame, so drawn once."""
+    """Rings, spokes, field of view and camera: drawn once, as they stay the same."""
     image: ImageArray = np.empty((frame.height, frame.width, 3), np.uint8)
     image[:] = _GROUND
     text = _text_height((frame.width, frame.height))
@@ -154,25 +153,15 @@ def _base(frame: RadarProjection, fov_deg: float, heading_deg: float) -> ImageAr
         at = frame.pixels([ring * math.cos(math.radians(15)), ring * math.sin(math.radians(15))])
         word = f"{ring:.0f} m"
         wide = text_size(word, text)[0]
-        back = (
-            at[0] - wide / 2 - 2,
-            at[1] - text / 2 - 3,
-            at[0] + wide / 2 + 2,
-            at[1] + text / 2 + 3,
-        )
+        u, v = at[0], at[1]
+        back = (u - wide / 2 - 2, v - text / 2 - 3, u + wide / 2 + 2, v + text / 2 + 3)
         fill_rect(image, back, _SEEN if ring < frame.range_m else _GROUND)
         draw_text(image, word, (at[0], at[1] - text / 2), text, _FAINT, anchor="centre")
     edge = frame.pixels(np.stack([arc[0], np.zeros(2), arc[-1]]))
     dashed(image, edge, _FAINT, 1, 5.0)
     camera = frame.pixels([0.0, 0.0])
     body = np.array([[-0.9, 0.75], [-0.9, -0.75], [0.35, -0.4], [0.35, 0.4]]) * text
-    spin = np.array(
-        [
-            [math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))],
-            [-math.sin(math.radians(heading_deg)), math.cos(math.radians(heading_deg))],
-        ]
-    )
-    turned = body @ spin
+    turned = body @ _rotation(math.radians(heading_deg))
     polygon(image, camera + np.stack([turned[:, 1], -turned[:, 0]], axis=1), PAPER)
     draw_text(image, "camera", (camera[0], camera[1] + text * 1.4), text, _FAINT, anchor="centre")
     image.setflags(write=False)
@@ -180,19 +169,16 @@ def _base(frame: RadarProjection, fov_deg: float, heading_deg: float) -> ImageAr
 
 
 def _draw_trails(
-    image: ImageArray,
-    frame: RadarProjection,
-    history: Mapping[int, FloatArray],
-    present: set[int],
-    data: OverlayData,
+    image: ImageArray, frame: RadarProjection, data: OverlayData, near: BoolArray
 ) -> None:
-    kinds = dict(zip(data.tracks.id.tolist(), data.tracks.kind.tolist(), strict=True))
-    for number, trail in history.items():
-        if number not in present or len(trail) < 2:
+    tracks = data.tracks
+    kinds = dict(zip(tracks.id[near].tolist(), tracks.kind[near].tolist(), strict=True))
+    for track_id, trail in data.history.items():
+        if track_id not in kinds or len(trail) < 2:
             continue
         points = frame.pixels(trail)
-        colour = KIND_COLOUR[Kind(int(kinds[number]))]
-        # Older parts fade into the ground, so that the trail also tells the direction.
+        colour = KIND_COLOUR[Kind(kinds[track_id])]
+        # Older parts are darker, so that the trail shows the direction.
         for part, fade in (
             (points[: len(points) // 2 + 1], 0.4),
             (points[len(points) // 2 :], 0.65),
@@ -204,7 +190,7 @@ def _draw_pair(
     image: ImageArray, frame: RadarProjection, data: OverlayData, rows: tuple[int, int]
 ) -> None:
     ends = frame.pixels(data.tracks.xy_m[list(rows)])
-    colour = SIGNAL_COLOUR["ALERT" if data.alerting else "WARNING"]
+    colour = data.pair_colour
     if data.alerting:
         polyline(image, ends, PAPER, 5)
         polyline(image, ends, colour, 3)
@@ -225,17 +211,16 @@ def _draw_distance(
     if pair is None:
         return
     ends = frame.pixels(data.tracks.xy_m[list(rows)])
-    colour = SIGNAL_COLOUR["ALERT" if data.alerting else "WARNING"]
     word = f"{pair.distance_m:.1f} m"
-    wide = text_size(word, text, True)[0] + text
-    if np.hypot(*(ends[1] - ends[0])) < wide + 3 * text:
-        return  # no room on the line; the list below tells the distance
+    if np.hypot(*(ends[1] - ends[0])) < text_size(word, text, True)[0] + 4 * text:
+        return  # no room on the line; the list below has the distance
     u, v = ends.mean(axis=0)
-    rect: Rect = (u - wide / 2, v - text, u + wide / 2, v + text)
-    fill_rect(image, rect, colour)
-    ink = readable_on(colour)
-    draw_text(image, word, (u, v - text / 2), text, ink, bold=True, anchor="centre")
-    taken.append(rect)
+    taken.append(draw_tag(image, word, (u, v), text, data.pair_colour))
+
+
+def _rotation(angle_rad: float) -> FloatArray:
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, s], [-s, c]])
 
 
 def _symbol(
@@ -253,8 +238,7 @@ def _symbol(
         shape = np.array([[1.5, 0.0], [-1.0, 1.05], [-0.45, 0.0], [-1.0, -1.05]])
     else:
         shape = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
-    c, s = math.cos(heading), math.sin(heading)
-    turned = shape @ np.array([[c, s], [-s, c]])
+    turned = shape @ _rotation(heading)
     offset = np.stack([turned[:, 1], -turned[:, 0]], axis=1)
     polygon(image, at + offset * (radius * 1.15 + 1.5), _GROUND)
     polygon(image, at + offset * radius * 1.15, colour)
@@ -279,7 +263,7 @@ def _draw_label(
 def _draw_list(
     image: ImageArray, frame: RadarProjection, data: OverlayData, reach: FloatArray, text: int
 ) -> None:
-    """The tracks in words below the radar, nearest first, as many as fit."""
+    """Table of the tracks below the radar, nearest first, as many as fit."""
     tracks = data.tracks
     top = frame.v0 + frame.range_m * frame.px_per_m * _BEHIND + text * 1.6
     line = text * 2.1

@@ -1,4 +1,4 @@
-"""Pictures into an MP4 file. The only part of the view that touches the disk."""
+"""Writes pictures to an MP4 file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from bikeped.types import ImageArray
 class VideoWriter:
     """Writes RGB pictures of one size to `path` (.mp4).
 
-    Writes beside it under a temporary name and renames at `close`, so that a half-written file
-    never stands under the asked-for name. As a context manager an exception discards the file.
+    Writes to a temporary file and renames it at `close`: a file of the final name is complete. As a
+    context manager an exception discards the file.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
@@ -46,13 +46,13 @@ class VideoWriter:
         if self._writer is None:
             raise ValueError(f"{self.path}: is closed already")
         if rgb.shape != (self.size[1], self.size[0], 3):
-            # OpenCV drops such a frame without a word.
+            # OpenCV drops such a frame silently.
             raise ValueError(f"VideoWriter: expected {self.size}, got shape {rgb.shape}")
         self._writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
         self.frames += 1
 
     def close(self) -> None:
-        """Finishes the file and gives it its name. Does nothing when called again."""
+        """Completes and renames the file; again is harmless."""
         if self._writer is None:
             return
         self._writer.release()
@@ -68,7 +68,7 @@ class VideoWriter:
             ) from error
 
     def discard(self) -> None:
-        """Stops and removes what was written so far."""
+        """Stops and removes the temporary file."""
         if self._writer is not None:
             self._writer.release()
             self._writer = None

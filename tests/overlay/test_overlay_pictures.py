@@ -181,7 +181,7 @@ def test_compose_has_the_size_asked_for_and_repeats(size):
 
 
 @pytest.mark.parametrize("tracks", [Tracks.empty(0.0)])
-def test_empty_moment_draws(tracks):
+def test_empty_data_draw(tracks):
     empty = OverlayData(
         Detections.empty(), tracks, Decision(0.0, State.IDLE, "IDLE: nobody."), 0, 0.0
     )
@@ -199,11 +199,11 @@ def test_jpeg_is_the_picture():
     assert np.abs(back.astype(int) - image).mean() < 4
 
 
-def test_sink_writes_a_video_and_only_at_close(tmp_path):
+def test_video_writer_writes_a_video_and_only_at_close(tmp_path):
     path = tmp_path / "out.mp4"
-    with VideoWriter(path, 30, (320, 180)) as sink:
+    with VideoWriter(path, 30, (320, 180)) as writer:
         for grey in range(0, 100, 10):
-            sink.write(np.full((180, 320, 3), (200, grey, 0), np.uint8))
+            writer.write(np.full((180, 320, 3), (200, grey, 0), np.uint8))
         assert not path.exists()
     assert [p.name for p in tmp_path.iterdir()] == ["out.mp4"]
     video = cv2.VideoCapture(str(path))
@@ -213,10 +213,10 @@ def test_sink_writes_a_video_and_only_at_close(tmp_path):
     assert frame[90, 160, 0] < 60
 
 
-def test_sink_discards_on_an_exception_and_refuses_other_sizes(tmp_path):
+def test_video_writer_discards_on_an_exception_and_refuses_other_sizes(tmp_path):
     def interrupted():
-        with VideoWriter(tmp_path / "out.mp4", 30, (320, 180)) as sink:
-            sink.write(np.zeros((10, 10, 3), np.uint8))
+        with VideoWriter(tmp_path / "out.mp4", 30, (320, 180)) as writer:
+            writer.write(np.zeros((10, 10, 3), np.uint8))
 
     with pytest.raises(ValueError, match="expected"):
         interrupted()
@@ -224,13 +224,13 @@ def test_sink_discards_on_an_exception_and_refuses_other_sizes(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["no/such/folder.mp4", "out.mov"])
-def test_sink_says_why_it_cannot_open(tmp_path, name):
+def test_video_writer_says_why_it_cannot_open(tmp_path, name):
     with pytest.raises(CaptureError, match=r"\.mp4|folder"):
         VideoWriter(tmp_path / name, 30, (320, 180))
 
 
-def test_sink_without_pictures_is_an_error(tmp_path):
-    sink = VideoWriter(tmp_path / "out.mp4", 30, (320, 180))
+def test_video_writer_without_pictures_is_an_error(tmp_path):
+    writer = VideoWriter(tmp_path / "out.mp4", 30, (320, 180))
     with pytest.raises(CaptureError, match="no picture"):
-        sink.close()
+        writer.close()
     assert list(tmp_path.iterdir()) == []
