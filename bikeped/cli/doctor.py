@@ -54,7 +54,7 @@ def command(
     report = {
         "ok": not failed,
         "source": str(file),
-        # `mend` is the name that `remedy` had in the first release.
+        # `mend` is the older name of `remedy`; readers of the report may use it.
         "checks": [{**dataclasses.asdict(f), "mend": f.remedy} for f in findings],
     }
     if json_path is not None:

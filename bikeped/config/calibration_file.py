@@ -38,7 +38,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def load_calibration(path: Path) -> tuple[Calibration, str]:
-    """The calibration and the SHA-256 of its file; CalibrationError names file, key and mend."""
+    """The calibration and the SHA-256 of its file; CalibrationError names file, key and remedy."""
     try:
         data = path.read_bytes()
     except OSError as error:
