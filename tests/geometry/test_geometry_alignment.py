@@ -15,6 +15,7 @@ from bikeped.geometry import GroundCamera, Lens
 from bikeped.geometry.alignment import (
     Alignment,
     Mark,
+    Residual,
     Spacing,
     ground_distance_m,
     pixel_at_distance,
@@ -117,6 +118,21 @@ def test_a_wrong_measurement_stands_out_and_widens_the_error() -> None:
     assert bad.outliers
     assert bad.suspect_mark == "4"
     assert bad.standard_errors["height_m"] > 2 * good.standard_errors["height_m"]
+
+
+def test_of_two_wrong_measurements_none_is_named_as_the_only_one() -> None:
+    truth = replace(CAMERA, height_m=4.2, pitch_deg=-7.3)
+    marks = seen(truth, (*FOUR, (8.0, 4.0), (5.0, -5.0)))
+    marks[3] = replace(marks[3], distance_m=marks[3].distance_m + 4.0)
+    marks[4] = replace(marks[4], distance_m=marks[4].distance_m + 2.0)
+    bad = fit_alignment(CAMERA, marks)
+    assert bad.outliers
+    assert bad.suspect_mark is None
+
+
+@pytest.mark.parametrize(("read_m", "is_outlier"), [(10.39, False), (10.41, True), (9.59, True)])
+def test_an_outlier_is_off_by_more_than_four_standard_errors(read_m, is_outlier) -> None:
+    assert Residual("1", "distance", 10.0, read_m, 0.1).is_outlier is is_outlier
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,13 @@ def test_pixels_go_there_and_back_to_the_rim(model, k):
     np.testing.assert_allclose(lens.radius(lens.theta(radius)), radius, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("projection", sorted(CURVES))
+def test_the_inverse_with_terms_is_exact_to_the_last_digits(projection):
+    lens = Lens.from_circle(projection, 1750.0, 170.0, (-0.02, 0.012, -0.004, 0.0007))
+    radius = np.linspace(1, 0.999 * lens.max_radius_px, 20001)
+    np.testing.assert_allclose(lens.radius(lens.theta(radius)), radius, rtol=2e-13)
+
+
 def test_orthographic_with_terms_inverts_to_its_very_rim():
     # There the radius hardly grows with the angle: the hardest place for Newton's method.
     lens = Lens("orthographic", 1000.0, math.pi / 2, (0.002, 0.0, 0.0, 0.0))

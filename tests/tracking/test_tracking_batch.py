@@ -296,6 +296,31 @@ def test_ten_people_of_whom_a_quarter_is_missed_never_become_eleven(spacing, lay
         assert most == 10
 
 
+def test_a_track_that_expired_in_a_gap_is_not_matched_after_it():
+    tracker = BatchTracker(TrackerSettings(max_unseen_s=1.0))
+    feed(tracker, 0.0, (5, 0))
+    feed(tracker, 3.0, (5, 0))
+    assert present(tracker) == {2: (5, 0)}
+
+
+def test_a_track_lives_exactly_as_long_as_it_may_be_unseen_at_every_frame():
+    for first in range(200):
+        tracker = BatchTracker(TrackerSettings(max_unseen_s=30 / 30))
+        feed(tracker, first / 30, (5, 0))
+        for frame in range(1, 31):
+            feed(tracker, (first + frame) / 30)
+        assert present(tracker) == {1: (5, 0)}, first
+        feed(tracker, (first + 31) / 30)
+        assert present(tracker) == {}, first
+
+
+def test_two_updates_at_one_time_are_allowed():
+    tracker = BatchTracker(TrackerSettings())
+    feed(tracker, 1.0, (5, 0))
+    feed(tracker, 1.0, (5, 0))
+    assert list(present(tracker)) == [1]
+
+
 # ---- batch
 
 

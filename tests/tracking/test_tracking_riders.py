@@ -79,6 +79,27 @@ def test_a_person_farther_than_a_rider_can_be_is_new():
     assert kinds(tracker) == {1: C, 2: P}
 
 
+@pytest.mark.parametrize(("unseen_frames", "continued"), [(29, True), (31, False)])
+def test_a_cyclist_unseen_for_a_second_is_not_continued_by_a_person(unseen_frames, continued):
+    tracker = BatchTracker(SETTINGS)
+    for frame in range(5):
+        feed(tracker, frame, (C, 0.0, 5.0))
+    for frame in range(5, 4 + unseen_frames):
+        feed(tracker, frame)
+    feed(tracker, 4 + unseen_frames, (P, 0.0, 5.0))
+    assert kinds(tracker) == ({1: C} if continued else {1: C, 2: P})
+
+
+def test_a_person_whom_the_gate_keeps_from_their_own_track_does_not_continue_a_cyclists():
+    settings = replace(SETTINGS, max_speed_mps=(6.0, 20.0, 40.0), position_noise_m=0.3)
+    tracker = BatchTracker(settings)
+    for frame in range(5):
+        feed(tracker, frame, (P, 0.0, 5.0), (C, 2.0, 5.0))
+    feed(tracker, 5, (P, 1.5, 5.0))  # 1.5 m in one frame: too far for the pedestrian's track
+    assert kinds(tracker) == {1: P, 2: C}
+    assert tracker.detection[0].tolist()[:2] == [-1, -1]
+
+
 def test_vehicles_and_the_simulation_are_left_alone():
     for settings, first, then in ((SETTINGS, V, P), (TrackerSettings(), C, P)):
         tracker = BatchTracker(settings)
