@@ -1,4 +1,4 @@
-"""Pictures in, road users out: the network, its layouts, and the rider-on-a-cycle rule."""
+"""Road-user detection: frames to boxes of pedestrians, cyclists and vehicles."""
 
 from bikeped.detection.base import DetectionResult, Detector
 from bikeped.detection.load import load_detector

@@ -1,4 +1,4 @@
-"""What a detector is to the rest of bikeped."""
+"""The detector interface."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bikeped.types import Detections, ImageArray
 
 @dataclass(frozen=True)
 class DetectionResult:
-    """What was found in one frame, and how long each stage took, in milliseconds."""
+    """Detections in one frame, and the time that each stage took, in milliseconds."""
 
     detections: Detections
     pre_ms: float
@@ -19,11 +19,11 @@ class DetectionResult:
 
 
 class Detector(Protocol):
-    """Finds road users in pictures. For one thread at a time: buffers are reused."""
+    """Detects road users in frames. For one thread at a time: buffers are reused."""
 
     @property
     def name(self) -> str:
-        """For people: the model file and what runs it."""
+        """The model file and its runtime, for messages."""
         ...
 
     @property
@@ -42,9 +42,9 @@ class Detector(Protocol):
         ...
 
     def decode_size(self, frame_width: int, frame_height: int) -> tuple[int, int]:
-        """Least width and height of picture that loses nothing against the full frame.
+        """Smallest decoded width and height that lose nothing against the full frame.
 
-        A JPEG decoder may stop at any reduced scale that is not smaller than this.
+        A JPEG decoder may use any reduced scale that is not smaller than this.
         """
         ...
 
@@ -52,8 +52,8 @@ class Detector(Protocol):
         """Detections in `rgb` [h, w, 3] uint8, a frame decoded at any scale.
 
         Boxes are in pixels of the full frame of `frame_width` x `frame_height`, clipped to it; most
-        confident first, equal confidences in the network's order, so the same picture gives the
-        same answer. Raises `DetectorError` where the network fails or answers no numbers, and
-        `ValueError` for a picture that is not the frame's.
+        confident first, equal confidences in the network's order (deterministic). Raises
+        `DetectorError` where the network fails or returns no numbers, and `ValueError` for an image
+        of another aspect ratio than the frame's.
         """
         ...

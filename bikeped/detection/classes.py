@@ -1,23 +1,20 @@
-"""From a model's class names to the three kinds that the decision knows."""
+"""Maps a model's class names to the three kinds of road user."""
 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.errors import DetectorError
 from bikeped.types import Kind, KindArray
 
-if TYPE_CHECKING:
-    from bikeped.config.schema.inputs import DetectionConfig
-
 log = logging.getLogger(__name__)
 
-#: Classes whose box holds a cycle and who rides it; COCO's `bicycle` is the cycle alone.
+#: Classes whose box holds a cycle and its rider; COCO's `bicycle` is the cycle alone.
 WITH_RIDER = frozenset({"cyclist", "bicyclist", "motorcyclist", "rider"})
-UNMAPPED = -1  #: in a kind table: a class that the decision does not know
+UNMAPPED = -1  #: in a kind table: a class that is no road user
 
 _COCO = (
     "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,"
@@ -34,10 +31,10 @@ COCO_NAMES: tuple[str, ...] = tuple(_COCO.split(","))
 
 
 def class_names(names: tuple[str, ...] | None, classes: int | None, source: str) -> tuple[str, ...]:
-    """The names of the model's classes: its own, or COCO's where it has none but 80 classes.
+    """The names of the model's classes: its own, or COCO's for 80 classes without names.
 
-    `classes` is the number that the output's shape implies, None where it implies none. Raises
-    `DetectorError` where the two disagree or nothing is known.
+    `classes` is the number that the output's shape implies, or None. Raises `DetectorError` where
+    the two disagree or the names are unknown.
     """
     if names is not None:
         if classes not in (None, len(names)):
@@ -58,8 +55,8 @@ def class_names(names: tuple[str, ...] | None, classes: int | None, source: str)
 def kind_table(names: tuple[str, ...], config: DetectionConfig, source: str) -> KindArray:
     """[nc] the `Kind` code of every class, `UNMAPPED` where the configuration names none.
 
-    Names are compared without regard to case and outer blanks. Raises `DetectorError` where one
-    name is given to two kinds or no class is mapped.
+    Comparison ignores case and surrounding whitespace. Raises `DetectorError` where one name is
+    given to two kinds or no class is mapped.
     """
     kinds: dict[str, Kind] = {}
     for kind, wanted in (
@@ -67,17 +64,17 @@ def kind_table(names: tuple[str, ...], config: DetectionConfig, source: str) -> 
         (Kind.CYCLIST, config.cyclist),
         (Kind.VEHICLE, config.vehicle),
     ):
-        for name in map(_plain, wanted):
+        for name in map(_normalised, wanted):
             if kinds.setdefault(name, kind) is not kind:
                 raise DetectorError(
                     f"detection.{kind.label} and detection.{kinds[name].label} both name {name!r}; "
                     "remove it from one"
                 )
-    table = np.array([kinds.get(_plain(name), UNMAPPED) for name in names], np.int8)
+    table = np.array([kinds.get(_normalised(name), UNMAPPED) for name in names], np.int8)
     missing = [kind.label for kind in Kind if not (table == kind).any()]
     if len(missing) == len(Kind):
         raise DetectorError(
-            f"{source}: none of the model's classes ({_some(names)}) is named by "
+            f"{source}: none of the model's classes ({_abbreviated(names)}) is named by "
             "detection.pedestrian, detection.cyclist or detection.vehicle; name them there"
         )
     for label in missing:
@@ -85,18 +82,20 @@ def kind_table(names: tuple[str, ...], config: DetectionConfig, source: str) -> 
     return table
 
 
-def riders_are_whole(names: tuple[str, ...], kinds: KindArray) -> bool:
-    """Whether every class that is a cyclist, by `kind_table`'s `kinds`, boxes the rider, too.
+def cyclist_classes_include_riders(names: tuple[str, ...], kinds: KindArray) -> bool:
+    """Whether the boxes of all cyclist classes, by `kind_table`'s `kinds`, hold the rider, too.
 
-    Of such a model nobody is to be joined to a cycle, and a person is either on one or not.
+    For such a model persons are not joined to cycles.
     """
-    mine = [name for name, kind in zip(names, kinds.tolist(), strict=True) if kind == Kind.CYCLIST]
-    return bool(mine) and all(_plain(name) in WITH_RIDER for name in mine)
+    cyclists = [
+        name for name, kind in zip(names, kinds.tolist(), strict=True) if kind == Kind.CYCLIST
+    ]
+    return bool(cyclists) and all(_normalised(name) in WITH_RIDER for name in cyclists)
 
 
-def _plain(name: str) -> str:
+def _normalised(name: str) -> str:
     return name.strip().lower()
 
 
-def _some(names: tuple[str, ...]) -> str:
+def _abbreviated(names: tuple[str, ...]) -> str:
     return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")

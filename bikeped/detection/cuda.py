@@ -1,4 +1,4 @@
-"""The few calls of the CUDA runtime library that the native engine needs, through ctypes.
+"""The CUDA runtime calls that the native TensorRT engine needs, through ctypes.
 
 The library comes with JetPack; no Python package is needed. Names and signatures are those of
 docs.nvidia.com/cuda/cuda-runtime-api. Not run on hardware here: tested against a stand-in library.
@@ -71,8 +71,8 @@ class Cuda:
         """Queues a copy from the GPU into a contiguous `array`."""
         self._copy(array.ctypes.data, device, array.nbytes, _DEVICE_TO_HOST)
 
-    def wait(self) -> None:
-        """Until everything queued is done."""
+    def synchronize(self) -> None:
+        """Waits until all queued work is done."""
         self._call("cudaStreamSynchronize", self._stream)
 
     def close(self) -> None:
@@ -99,8 +99,8 @@ class Cuda:
         status = int(getattr(self._library, function)(*arguments))
         if status:
             text = self._library.cudaGetErrorString(ctypes.c_int(status))
-            words = text.decode(errors="replace") if isinstance(text, bytes) else "unknown"
-            raise DetectorError(f"CUDA: {function} failed with {status} ({words})")
+            reason = text.decode(errors="replace") if isinstance(text, bytes) else "unknown"
+            raise DetectorError(f"CUDA: {function} failed with {status} ({reason})")
 
 
 def _load() -> Any:

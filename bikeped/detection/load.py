@@ -1,34 +1,31 @@
-"""From the configuration to a detector: which runtime runs the model file."""
+"""Creates the detector that the configuration describes."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.base import Detector
 from bikeped.detection.model_hash import verify_sha256
 from bikeped.errors import DetectorError
 from bikeped.models import model_file
 from bikeped.types import Region
 
-if TYPE_CHECKING:
-    from bikeped.config.schema.inputs import DetectionConfig
-
 
 def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None = None) -> Detector:
-    """The detector that `detection` describes, warmed up: the first frame is no slower than others.
+    """The detector of the section `detection`, warmed up.
 
-    `base_dir` is the folder that a relative `detection.model` starts from; `bundled` is the model
-    that comes with bikeped, on a processor in eight bits. `road`: the part of the camera's frames
-    that road users can be in, for `detection.region`; None: unknown, all are shown. Raises
-    `DetectorError` where there is no model, its hash differs, or it cannot be run or understood.
+    A relative `detection.model` starts from `base_dir`; `bundled` is the model that comes with
+    bikeped, with 8-bit weights on a CPU. `road` is the part of the frames in which road users can
+    appear, for `detection.region`; None: the whole frame. Raises `DetectorError` where there is no
+    model, its hash differs, it cannot be run, or its output layout is unknown.
     """
     if config.model is None:
         raise DetectorError(
             "detection.model: no model is configured; name an .onnx or .engine file, or bundled"
         )
     path = model_file(config.model, base_dir)
-    # Imported where needed: a pole with an engine does without onnxruntime, and the reverse.
+    # Imported where needed: an .engine does not need onnxruntime, nor an .onnx file tensorrt.
     if path.suffix.lower() == ".onnx":
         from bikeped.detection.onnx_runtime import OnnxDetector, runs_on_cpu
 

@@ -1,4 +1,4 @@
-"""The SHA-256 of a model file: its identity in the log, and the guard against a swapped one."""
+"""The SHA-256 of a model file: its identity in messages, and the check of `detection.sha256`."""
 
 from __future__ import annotations
 

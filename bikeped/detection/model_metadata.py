@@ -11,16 +11,14 @@ import ast
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.errors import DetectorError
 from bikeped.types import Region
-
-if TYPE_CHECKING:
-    from bikeped.config.schema.inputs import DetectionConfig
 
 _LONGEST_LITERAL = 1 << 20
 _DEFAULT_SIZE = 640  #: Ultralytics' default, where neither the shape nor the metadata names one

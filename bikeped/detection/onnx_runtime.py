@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.model_metadata import (
     ModelMetadata,
@@ -20,9 +21,6 @@ from bikeped.detection.model_metadata import (
 )
 from bikeped.errors import DetectorError
 from bikeped.types import Region
-
-if TYPE_CHECKING:
-    from bikeped.config.schema.inputs import DetectionConfig
 
 log = logging.getLogger(__name__)
 

@@ -1,8 +1,8 @@
-"""Two boxes of one person: the whole, and head and shoulders alone.
+"""Suppresses a person's upper half beside the whole person.
 
-Detectors answer a person whose legs are hard to see with both. They overlap by about a half, which
-suppression lets pass, and the upper one ends where no feet are: on the ground it would be a second
-pedestrian, metres behind the first and closing in with it on whatever comes.
+For a person whose legs are hard to see, detectors return both boxes. They overlap by about half,
+which suppression lets pass, and the bottom of the upper box is not at the feet: on the ground it
+would be a second pedestrian, metres behind the first, that closes in with it.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ import numpy as np
 from bikeped.geometry.boxes import intersection_area
 from bikeped.types import BoolArray, Detections, Kind
 
-# The half lies by this share of its area within the whole,
+# At least this share of the half lies within the whole; it
 _WITHIN = 0.85
-# starts within this share of the whole's height from its top (a child before an adult: lower),
+# starts within this share of the whole's height from its top (a child in front: lower),
 _TOP = 0.2
-# ends above this share of it (else suppression is the judge),
+# is lower than this share of it (else ordinary suppression applies),
 _HEIGHT = 0.8
 # and is at least this share as wide (a narrow person within a group's box is a person).
 _WIDTH = 0.5
 
 
 def suppress_partial_person_boxes(found: Detections) -> Detections:
-    """The detections without pedestrians that are another's upper half; order is kept.
+    """The detections without pedestrians that are another's upper half, most confident first.
 
-    The whole takes the greater confidence of the two.
+    The whole gets the greater confidence of the two. Without such a half, `found` itself.
     """
     person = np.nonzero(found.kind == Kind.PEDESTRIAN)[0]
     if len(person) < 2:

@@ -1,15 +1,14 @@
-"""A person on a bicycle or motorcycle is one cyclist, never also a pedestrian.
+"""Joins a person on a bicycle or motorcycle and the cycle to one cyclist.
 
-Detectors trained on COCO answer a rider with two boxes, `person` and `bicycle`. Left so, every
-cyclist would carry a pedestrian along, closing on it forever, and the light would warn of nothing.
-Here the pair becomes one cyclist: its box is the union, so its bottom centre is the wheel line; its
-confidence the greater of the two.
+Detectors trained on COCO return two boxes for a rider, `person` and `bicycle`. Unjoined, every
+cyclist would carry a pedestrian along, closing in on it forever. The joined box is the union, so
+its bottom centre is on the wheel line; its confidence is the greater of the two.
 
-A person beside, before or behind a cycle stays a pedestrian: the cycle must cover the person from
-the waist down, the middle of the person must lie over the cycle, the feet must be near the wheel
-line and the sizes must belong together. Each cycle takes one rider and each rider one cycle, best
-cover first (greedy: pairs that compete are rare and the best pair is then the right one). A cycle
-that nobody rides stays a cyclist, and a weak one is dropped: see `join_riders`.
+A person beside, in front of or behind a cycle stays a pedestrian: the cycle must cover the person
+from the waist down, the person's middle must be over the cycle, the feet near the wheel line and
+the sizes in proportion. Each cycle takes one rider and each rider one cycle, best cover first
+(greedy: competing pairs are rare, and the best pair is then the right one). A cycle without a rider
+stays a cyclist; `join_riders` drops a weak one.
 """
 
 from __future__ import annotations
@@ -23,24 +22,24 @@ from bikeped.types import BoolArray, Detections, Float32Array, FloatArray, Kind
 
 # The feet against the wheel line, as shares of the cycle's height: farther below it is someone in
 # front, farther above it someone behind.
-_FEET_BELOW, _FEET_ABOVE = 0.25, 0.55
+_MAX_FEET_BELOW, _MAX_FEET_ABOVE = 0.25, 0.55
 # Detectors often end a rider's box where the frame of the bicycle hides the legs. Such a box may
 # end this far above the wheel line if head to wheel line is no more than a rider's: someone walking
 # behind stands higher in the picture. (In the clip that the tests use, every rider is cut so.)
-_CUT_ABOVE, _CUT_SPAN = 0.9, 2.0
+_MAX_CUT_ABOVE, _MAX_CUT_SPAN = 0.9, 2.0
 # Person's height over the cycle's. A whole rider measures 1.2 to 2.2 of a bicycle, about one of a
 # box that holds both; the bounds leave room for half-seen riders and for partial boxes.
-_LEAST_RATIO, _MOST_RATIO = 0.4, 3.5
-# A second sight of a rider shares this much of the smaller box with the first.
-_SAME_RIDER = 0.8
+_MIN_RATIO, _MAX_RATIO = 0.4, 3.5
+# A second box of one rider shares this much of the smaller box with the first.
+_MIN_SAME_RIDER = 0.8
 # A part of a cycle (a wheel, a half) lies by this share of its area within the joined box, and is
 # no larger than this share of it.
-_PART_WITHIN, _PART_SIZE = 0.6, 0.5
+_MIN_PART_WITHIN, _MAX_PART_SIZE = 0.6, 0.5
 
 
 @dataclass(frozen=True)
 class _Match:
-    """Persons against cycles, [n, m]: how well each would sit on each."""
+    """How well each person [n] fits each cycle [m], as a rider."""
 
     cover: FloatArray  #: share of the person from the waist down that the cycle's box covers
     offset: FloatArray  #: of the middles, as a share of the cycle's width
@@ -51,47 +50,48 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
     """The detections with every rider and cycle joined to one cyclist, most confident first.
 
     `overlap` is `detection.rider_overlap`; 1 joins nothing. `confidence` is `detection.confidence`:
-    cycles below it may be handed in and count only under a rider of at least that confidence. On
-    its own a faint cycle is noise, under a person it is the reason not to call that person a
-    pedestrian. Equal confidences keep their order.
+    cycles below it count only under a rider of at least that confidence. A faint cycle alone is
+    noise; under a person it shows that the person is a cyclist. Equal confidences keep their order.
     """
     person = np.nonzero(found.kind == Kind.PEDESTRIAN)[0]
     cycle = np.nonzero(found.kind == Kind.CYCLIST)[0]
     box, score = found.box_px.copy(), found.confidence.copy()
-    gone = (found.kind == Kind.CYCLIST) & (score < confidence)
+    dropped = (found.kind == Kind.CYCLIST) & (score < confidence)
     if overlap < 1 and len(person) and len(cycle):
         match = _match(found.box_px[person], found.box_px[cycle], overlap)
         pairs = _pairs(match)
         ridden = np.zeros(len(found), np.bool_)
         ridden[cycle[[j for _, j in pairs]]] = True
-        aboard = np.zeros(len(found), np.bool_)
-        aboard[person[[i for i, _ in pairs]]] = True
-        gone |= aboard
-        gone &= ~ridden
+        riding = np.zeros(len(found), np.bool_)
+        riding[person[[i for i, _ in pairs]]] = True
+        dropped |= riding
+        dropped &= ~ridden
         for i, j in pairs:
             rider, own = person[i], cycle[j]
             box[own, :2] = np.minimum(box[rider, :2], box[own, :2])
             box[own, 2:] = np.maximum(box[rider, 2:], box[own, 2:])
             score[own] = max(score[rider], score[own])
-            # The same rider seen twice (head and shoulders, say) must not stay a pedestrian, nor a
-            # wheel of the same cycle another cyclist.
+            # A second box of the rider (head and shoulders) must not stay a pedestrian, nor a wheel
+            # of the cycle another cyclist.
             shared = intersection_area(found.box_px[person], found.box_px[rider])
             area = box_area(found.box_px[person])
             least = np.minimum(area, area[i])
-            gone[person[match.fits[:, j] & (shared >= _SAME_RIDER * least)]] = True
+            dropped[person[match.fits[:, j] & (shared >= _MIN_SAME_RIDER * least)]] = True
             shared = intersection_area(found.box_px[cycle], box[own])
             area = box_area(found.box_px[cycle])
-            part = (shared >= _PART_WITHIN * area) & (area <= _PART_SIZE * box_area(box[own]))
-            gone[cycle[part & ~ridden[cycle] & (found.confidence[cycle] <= score[own])]] = True
-    left = np.nonzero(~gone)[0]
+            part = (shared >= _MIN_PART_WITHIN * area) & (
+                area <= _MAX_PART_SIZE * box_area(box[own])
+            )
+            dropped[cycle[part & ~ridden[cycle] & (found.confidence[cycle] <= score[own])]] = True
+    left = np.nonzero(~dropped)[0]
     order = left[np.argsort(-score[left], kind="stable")]
     return Detections(found.kind[order], score[order], box[order])
 
 
 def _pairs(match: _Match) -> list[tuple[int, int]]:
-    """Rider and cycle, each used once, best cover first; near middles decide between equals."""
+    """Rider and cycle, each used once: best cover first, then the smaller offset."""
     i, j = np.nonzero(match.fits)
-    # Rounded: covers that differ in the last digit only are equal, and the middles tell.
+    # Rounded: covers that differ in the last digit only are equal.
     order = np.lexsort((j, i, match.offset[i, j], -np.round(match.cover[i, j], 2)))
     pairs: list[tuple[int, int]] = []
     for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True):
@@ -111,7 +111,7 @@ def _match(person: Float32Array, cycle: Float32Array, overlap: float) -> _Match:
     feet = (p[..., 3] - c[..., 3]) / tall  # below the wheel line is positive
     span = (c[..., 3] - p[..., 1]) / tall
     ratio = (p[..., 3] - p[..., 1]) / tall
-    stands = (feet >= -_FEET_ABOVE) | ((feet >= -_CUT_ABOVE) & (span <= _CUT_SPAN))
-    fits = stands & (feet <= _FEET_BELOW) & (offset <= 0.5) & (cover >= overlap) & (cover > 0)
-    fits &= (ratio >= _LEAST_RATIO) & (ratio <= _MOST_RATIO)
+    stands = (feet >= -_MAX_FEET_ABOVE) | ((feet >= -_MAX_CUT_ABOVE) & (span <= _MAX_CUT_SPAN))
+    fits = stands & (feet <= _MAX_FEET_BELOW) & (offset <= 0.5) & (cover >= overlap) & (cover > 0)
+    fits &= (ratio >= _MIN_RATIO) & (ratio <= _MAX_RATIO)
     return _Match(cover, offset, fits)

@@ -1,9 +1,8 @@
-"""The detector on a native TensorRT 10 engine, by JetPack's own `tensorrt` package.
+"""The detector on a native TensorRT 10 engine, through JetPack's `tensorrt` package.
 
-An engine is bound to the GPU and the TensorRT version that built it. The package is imported only
-when an `.engine` is loaded; it comes with JetPack, not from PyPI. A file written by Ultralytics
-starts with a 4-byte little-endian length and that many bytes of JSON; a bare engine, as trtexec
-writes it, is read too.
+An engine fits the GPU and the TensorRT version that built it. The package is imported only when an
+`.engine` is loaded; it comes with JetPack, not from PyPI. A file written by Ultralytics starts with
+a 4-byte little-endian length and that many bytes of JSON; a bare engine (trtexec) works, too.
 
 Not run on hardware here: written against the documented API (docs.nvidia.com/deeplearning/tensorrt,
 Python API: ICudaEngine, IExecutionContext) and tested with a stand-in for the package.
@@ -15,11 +14,12 @@ import importlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from bikeped.config.schema.inputs import DetectionConfig
 from bikeped.detection.cuda import Cuda
 from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.model_metadata import (
@@ -30,9 +30,6 @@ from bikeped.detection.model_metadata import (
 )
 from bikeped.errors import DetectorError
 from bikeped.types import Region
-
-if TYPE_CHECKING:
-    from bikeped.config.schema.inputs import DetectionConfig
 
 _LARGEST_HEADER = 1 << 20
 #: TensorRT's DataType by name. Its own `nptype` is avoided: it touches np.bool in some releases.
@@ -127,7 +124,7 @@ class EngineBackend:
             raise DetectorError(f"{self._source}: TensorRT failed to run the engine; see its log")
         for _, array, address in self._outputs:
             self._cuda.download(array, address)
-        self._cuda.wait()
+        self._cuda.synchronize()
         return [(name, array) for name, array, _ in self._outputs]
 
     def _bind_input(self, name: str) -> npt.NDArray[Any]:

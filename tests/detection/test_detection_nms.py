@@ -38,6 +38,15 @@ def scene(n, seed, groups=3, crowd=None):
     return box, score, rng.integers(0, groups, n).astype(np.int8)
 
 
+def test_an_overlap_of_exactly_the_threshold_suppresses_nothing():
+    pair = np.array([[0, 0, 2, 1], [0, 0, 1, 1]], np.float32)
+    far = 10 + 4 * np.arange(199, dtype=np.float32)[:, None] + np.array([0, 0, 1, 1], np.float32)
+    for box in (pair, np.concatenate([pair[:1], far, pair[1:]])):  # in one block, and in two
+        score = np.linspace(1, 0.5, len(box)).astype(np.float32)
+        assert len(non_max_suppression(box, score, np.zeros(len(box)), 0.5, 1000)) == len(box)
+        assert len(non_max_suppression(box, score, np.zeros(len(box)), 0.499, 1000)) < len(box)
+
+
 @pytest.mark.parametrize(("n", "crowd"), [(0, 1), (1, 1), (300, None), (700, 3), (700, 600)])
 @pytest.mark.parametrize("iou", [0.1, 0.45, 0.9])
 def test_equal_to_the_plain_loop(n, crowd, iou):
