@@ -75,7 +75,6 @@ def _checked(before: str, after: str, section: str, values: Mapping[str, Any], s
 
 def _yaml() -> YAML:
     yaml = YAML()
-    yaml.preserve_quotes = True
     yaml.width = 1_000_000  # never break a line
     return yaml
 
