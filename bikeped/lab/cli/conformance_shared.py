@@ -10,16 +10,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table as RichTable
 
-from bikeped.cli.common import FiniteRange, config_options, console, json_option, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    console,
+    json_option,
+    text_table,
+    write_json,
+)
 from bikeped.cli.guard import guarded
 from bikeped.config import DecisionConfig, LoadedConfig, load_config
 from bikeped.cores import cores
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
     from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
     from bikeped.lab.simulation.suite import Suite
 
@@ -160,34 +167,28 @@ burst_option = click.option(
 
 
 def print_table(screen: Console, table: ResultTable) -> None:
-    """A table for people."""
+    """Prints a result's table for people."""
     screen.print(rich_table(table))
 
 
 def rich_table(table: ResultTable) -> RichTable:
-    """A table for a terminal: per cent with one decimal, seconds with two."""
-    drawn = RichTable(
-        title=escape(table.title),
-        title_justify="left",
-        caption=escape(table.note) or None,
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
+    """A result's table for a terminal: per cent with one decimal, seconds with two."""
+    text = [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
+    return text_table(
+        table.columns,
+        [map(_cell_text, row, table.columns) for row in table.rows],
+        align="".join("l" if is_text else "r" for is_text in text),
+        title=table.title,
+        note=table.note,
     )
-    for column, name in enumerate(table.columns):
-        is_text = any(isinstance(row[column], str) for row in table.rows)
-        drawn.add_column(escape(name), justify="left" if is_text else "right")
-    for row in table.rows:
-        drawn.add_row(*(cell_text(c, n) for c, n in zip(row, table.columns, strict=True)))
-    return drawn
 
 
-def cell_text(cell: CellValue, column: str) -> str:
-    """One figure as the column's name asks for it; a dash where there is none."""
+def _cell_text(cell: CellValue, column: str) -> str:
+    """One value as the column's name asks for it; a dash where there is none."""
     if cell is None:
         return "-"
     if isinstance(cell, float) and column.endswith("%"):
         return f"{cell:.1f}"
     if isinstance(cell, float) and column.endswith(", s"):
         return f"{cell:.2f}"
-    return f"{cell:g}" if isinstance(cell, float) else escape(str(cell))
+    return f"{cell:g}" if isinstance(cell, float) else str(cell)
