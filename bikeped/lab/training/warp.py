@@ -1,17 +1,17 @@
-"""An ordinary picture as a fisheye lens would have taken it, and its boxes with it.
+"""Warps an ordinary picture and its boxes as if taken through a fisheye lens.
 
-The picture is taken for a perspective view of `picture_fov_deg` over its longer side, turned about
-its own axis (roll), up or down (pitch) and sideways about the upright (yaw), and seen through a
-fisheye lens whose image circle lies in a square of `size_px`. Upright people so stay upright in
-space, and lean in the picture as they do before a level camera on a pole.
+The picture is treated as a perspective view of `picture_fov_deg` over its longer side, turned about
+its axis (roll), up or down (pitch) and about the vertical (yaw), and seen through a fisheye lens
+whose image circle lies in a square of `size_px`. So upright people lean in the picture as before a
+level camera on a pole.
 
-Both cameras are `GroundCamera`s: the directions are those that the deployed ground table uses. A
-box becomes the tight upright rectangle of its *curve*: its four edges (or its object's outline),
-sampled densely and mapped, cut by the image circle and the picture. Four corners alone would miss
-the belly of a bent edge by tens of pixels.
+Both cameras are `GroundCamera`s, with the directions of the deployed ground table. A box becomes
+the tight upright rectangle of its mapped outline: its four edges, or its object's polygons, densely
+sampled and cut by the image circle and the picture. The four corners alone would miss the bulge of
+an edge by tens of pixels.
 
-Points are in pixels from the upper left corner of the picture, as COCO's boxes are: the middle of
-the first pixel is (0.5, 0.5).
+Points are in pixels from the upper left corner, as COCO's boxes are: the middle of the first pixel
+is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
 
 #: Samples of a box's edge, of an object's outline, and of the image circle's rim.
 EDGE_SAMPLES, OUTLINE_SAMPLES, RIM_SAMPLES = 256, 1024, 4096
-#: Where the lens sees and the picture has nothing: the grey that detectors know as "no picture".
+#: Grey of the image circle outside the picture: the padding of letterboxed detector inputs.
 FILL = 114
-_HALVINGS = 24  # of the way between two samples, to where a curve leaves what is seen
-_SHARE_GRID = 24  # points a side that tell how much of a box is left
-_WIDEST = {"orthographic": 178.0, "stereographic": 300.0}  # short of the model's own end
+_HALVINGS = 24  # bisection steps to the point where a curve leaves the visible part
+_SHARE_GRID = 24  # points a side to measure the visible share of a box
+_WIDEST = {"orthographic": 178.0, "stereographic": 300.0}  # short of the model's limit
 _ROOM = 359.0
 _WIDEST_PICTURE = 160.0
 
@@ -46,11 +46,11 @@ Size = tuple[int, int]  #: width, height in pixels
 
 @dataclass(frozen=True)
 class WarpRanges:
-    """What `sample_warp` draws from, uniformly; each range is (least, most).
+    """Ranges (least, most) that `sample_warp` samples uniformly.
 
-    `radius_share` and `shift_share` are the circle's radius and its centre's distance from the
-    middle, each way, as shares of `size_px`. `fov_deg` is what the circle spans; a projection that
-    cannot show as much (orthographic: 180) is drawn from the part of the range that it can.
+    `radius_share` and `shift_share` are the circle's radius and the offset of its centre on each
+    axis, as shares of `size_px`. `fov_deg` of the circle is limited to what the projection can
+    show (orthographic: 180).
     """
 
     projections: tuple[str, ...] = ("equidistant", "equisolid", "stereographic", "orthographic")
@@ -87,13 +87,13 @@ class WarpRanges:
             raise GeometryError(f"size: {self.size_px} is not 64 to 8192 pixels")
 
     def as_dict(self) -> dict[str, Any]:
-        """For the record that augmented data carry."""
+        """For the record in augmented data."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
 @dataclass(frozen=True)
 class Warp:
-    """One drawn lens and direction; see the module. Angles as `GroundCamera` counts them."""
+    """A sampled lens and direction; see the module. Angles as in `GroundCamera`."""
 
     lens: Lens
     centre_px: tuple[float, float]
@@ -112,10 +112,7 @@ class Warp:
         object.__setattr__(self, "_fisheye", GroundCamera(self.lens, *self.centre_px, height_m=1.0))
 
     def forward(self, xy_px: FloatArray, picture_wh: Size) -> tuple[FloatArray, BoolArray]:
-        """Where points [..., 2] of the picture come to lie, and which are seen.
-
-        Seen means inside the image circle and inside the square.
-        """
+        """Maps points [..., 2] of the picture; also which are visible (in circle and square)."""
         ray = _picture_camera(picture_wh, self.picture_fov_deg, self.pitch_deg, self.yaw_deg).rays(
             self._rolled(xy_px, picture_wh, self.roll_deg)
         )
@@ -124,10 +121,8 @@ class Warp:
         return uv, seen & ((uv >= 0) & (uv <= self.size_px)).all(axis=-1)
 
     def inverse(self, uv_px: FloatArray, picture_wh: Size) -> tuple[FloatArray, BoolArray]:
-        """Which points of the picture are seen at [..., 2], and where the picture has any.
-
-        Points outside the image circle are NaN.
-        """
+        """Maps points [..., 2] back to the picture, NaN outside the image circle; also which of
+        them lie in the picture."""
         ray = self._fisheye.rays(uv_px)
         picture = _picture_camera(picture_wh, self.picture_fov_deg, self.pitch_deg, self.yaw_deg)
         xy, ahead = picture.project(ray + np.array([0.0, 0.0, 1.0]))
@@ -136,7 +131,7 @@ class Warp:
         return xy, ahead & inside
 
     def as_dict(self) -> dict[str, Any]:
-        """For the record that an augmented picture carries."""
+        """For the record in an augmented picture's entry."""
         return {
             "projection": self.lens.projection,
             "fov_deg": round(math.degrees(2 * self.lens.max_theta_rad), 3),
@@ -149,7 +144,7 @@ class Warp:
         }
 
     def _rolled(self, xy_px: FloatArray, picture_wh: Size, angle_deg: float) -> FloatArray:
-        """Points turned about the picture's middle, clockwise as one looks at it."""
+        """Points turned clockwise about the picture's middle."""
         if angle_deg == 0:
             return xy_px
         c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
@@ -161,7 +156,7 @@ class Warp:
 def _picture_camera(
     picture_wh: Size, fov_deg: float, pitch_deg: float, yaw_deg: float
 ) -> GroundCamera:
-    """The perspective camera that took the picture, a metre above its own ground."""
+    """The perspective camera of the picture, a metre above its own ground."""
     wide, high = picture_wh
     focal = max(wide, high) / 2 / math.tan(math.radians(fov_deg) / 2)
     lens = Lens("perspective", focal, math.radians(89.5))
@@ -169,7 +164,7 @@ def _picture_camera(
 
 
 def sample_warp(rng: np.random.Generator, ranges: WarpRanges) -> Warp:
-    """One warp out of the ranges. The same generator state gives the same warp."""
+    """A random warp; the same generator state gives the same warp."""
     projection = ranges.projections[int(rng.integers(len(ranges.projections)))]
     widest = _WIDEST.get(canonical_projection(projection), _ROOM)
     least, most = (min(angle, widest) for angle in ranges.fov_deg)
@@ -188,9 +183,8 @@ def sample_warp(rng: np.random.Generator, ranges: WarpRanges) -> Warp:
 def warp_picture(image: ImageArray, warp: Warp) -> ImageArray:
     """The picture [h, w, 3] through the lens: [size, size, 3], black outside the image circle.
 
-    Where the lens shrinks, a pixel takes the mean of what it covers: from copies of the picture at
-    half, a quarter, ... of its size, mixed by the local scale (the root of the area that a pixel
-    covers). Bilinear otherwise.
+    Where the lens shrinks, pixels are interpolated between levels of an image pyramid, by the local
+    scale (the root of the area that a pixel covers); bilinear otherwise.
     """
     high, wide = image.shape[:2]
     size = warp.size_px
@@ -213,7 +207,7 @@ def warp_picture(image: ImageArray, warp: Warp) -> ImageArray:
 
 
 def _picture_window(warp: Warp, picture_wh: Size) -> tuple[int, int, int, int]:
-    """Pixels of the square that can show the picture: left, top, right, lower end, exclusive."""
+    """Bounds of the picture in the square: left, top, right, bottom (exclusive)."""
     whole = np.array([[0.0, 0.0, picture_wh[0], picture_wh[1]]])
     box, share = warp_boxes(warp, picture_wh, whole)
     if share[0] == 0 and not np.isfinite(box).all():
@@ -225,7 +219,7 @@ def _picture_window(warp: Warp, picture_wh: Size) -> tuple[int, int, int, int]:
 
 
 def _pyramid_level(xy: FloatArray, inside: BoolArray) -> Float32Array:
-    """[h, w] log2 of the local shrinking, 0 where the lens enlarges."""
+    """[h, w] log2 of the local downscaling, 0 where the lens enlarges."""
     if min(xy.shape[:2]) < 2:
         return np.zeros(xy.shape[:2], np.float32)
     x, y = xy[..., 0], xy[..., 1]
@@ -240,7 +234,7 @@ def _pyramid_level(xy: FloatArray, inside: BoolArray) -> Float32Array:
 def _sample_pyramid(
     image: ImageArray, xy: Float32Array, level: Float32Array, inside: BoolArray
 ) -> ImageArray:
-    """The picture read at `xy`, each pixel from the two copies around its level."""
+    """The picture sampled at `xy`, each pixel from the two pyramid levels around its own."""
     high, wide = image.shape[:2]
     most = max(0, math.floor(math.log2(max(min(high, wide) / 4, 1))))
     level = np.minimum(level, most)
@@ -269,10 +263,10 @@ def warp_boxes(
     box_px: npt.ArrayLike,
     polygons: Sequence[Sequence[FloatArray]] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Boxes [n, 4] (x1, y1, x2, y2) of the picture after the warp, and the share of each left [n].
+    """Warps boxes [n, 4] (x1, y1, x2, y2); also the visible share [n] of each original area.
 
-    `polygons` are each object's outlines, empty where it has none: its box's edges then stand in.
-    The share is of the area in the original picture; what has none left is NaN.
+    `polygons` are each object's outlines; without any its box's edges are used. A box of which
+    nothing is visible is NaN.
     """
     boxes = np.asarray(box_px, np.float64).reshape(-1, 4)
     result = np.full((len(boxes), 4), np.nan)
@@ -310,7 +304,7 @@ def _box_edges(box: FloatArray) -> FloatArray:
 
 
 def _outline(ring: FloatArray) -> FloatArray:
-    """A closed outline with points added, so that none are far apart."""
+    """A closed outline, resampled evenly."""
     step = np.roll(ring, -1, axis=0) - ring
     length = np.hypot(step[:, 0], step[:, 1])
     spacing = max(float(length.sum()) / OUTLINE_SAMPLES, 1e-9)
@@ -322,7 +316,7 @@ def _outline(ring: FloatArray) -> FloatArray:
 
 
 def _exit_points(warp: Warp, picture_wh: Size, curve: FloatArray, seen: BoolArray) -> FloatArray:
-    """[k, 2] the last points seen of a closed curve where it leaves what the lens shows."""
+    """[k, 2] the points where a closed curve leaves the visible part."""
     after = np.roll(seen, -1)
     leaves = np.nonzero(seen != after)[0]
     here, there = curve[leaves], np.roll(curve, -1, axis=0)[leaves]
@@ -336,7 +330,7 @@ def _exit_points(warp: Warp, picture_wh: Size, curve: FloatArray, seen: BoolArra
 
 
 def _visible_border(warp: Warp, picture_wh: Size) -> tuple[FloatArray, FloatArray]:
-    """Points along the rim of what is seen that show the picture: in the square, in the picture."""
+    """Points along the border of the visible part: in the square, and in the picture."""
     size = float(warp.size_px)
     turn = np.linspace(0, 2 * math.pi, RIM_SAMPLES, endpoint=False)
     rim = np.stack([np.cos(turn), np.sin(turn)], -1) * (warp.lens.max_radius_px * (1 - 1e-9))
@@ -352,7 +346,7 @@ def _visible_border(warp: Warp, picture_wh: Size) -> tuple[FloatArray, FloatArra
 
 
 def _in_object(xy: FloatArray, box: FloatArray, rings: Sequence[FloatArray]) -> BoolArray:
-    """Which points [n, 2] of the picture belong to the object."""
+    """Which points [n, 2] of the picture lie in the object."""
     inside: BoolArray = np.asarray(
         (xy[:, 0] >= box[0]) & (xy[:, 1] >= box[1]) & (xy[:, 0] <= box[2]) & (xy[:, 1] <= box[3])
     )
@@ -364,8 +358,7 @@ def _in_object(xy: FloatArray, box: FloatArray, rings: Sequence[FloatArray]) -> 
 
 
 def _in_polygon(xy: FloatArray, ring: FloatArray) -> BoolArray:
-    """Which points lie inside a closed outline (a ray to the right crosses it an odd number of
-    times)."""
+    """Which points lie inside a closed outline, by the even-odd rule."""
     x, y = xy[:, 0, None], xy[:, 1, None]
     x1, y1 = ring[:, 0], ring[:, 1]
     x2, y2 = np.roll(x1, -1), np.roll(y1, -1)
@@ -378,7 +371,7 @@ def _in_polygon(xy: FloatArray, ring: FloatArray) -> BoolArray:
 def _visible_share(
     warp: Warp, picture_wh: Size, box: FloatArray, rings: Sequence[FloatArray]
 ) -> float:
-    """Share of the object's area in the picture that is still seen, on a grid of points."""
+    """Visible share of the object's area in the picture, on a grid of points."""
     step = (np.arange(_SHARE_GRID) + 0.5) / _SHARE_GRID
     x, y = box[0] + (box[2] - box[0]) * step, box[1] + (box[3] - box[1]) * step
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)

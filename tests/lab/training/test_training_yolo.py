@@ -83,7 +83,7 @@ def library(monkeypatch):
     module.LibreYOLO = lambda path, device: LibreYOLO9(path, None, device)
     monkeypatch.setitem(sys.modules, "libreyolo", module)
     monkeypatch.setattr("bikeped.errors.find_spec", lambda name: object())
-    monkeypatch.setattr(yolo, "_version", lambda name: "1.6.0")
+    monkeypatch.setattr(yolo, "version", lambda name: "1.6.0")
     LibreYOLO9.made = []
     return module
 
