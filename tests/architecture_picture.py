@@ -1,6 +1,6 @@
 """Draws docs/architecture.svg: rooms by layer, and the imports between them, read from the code.
 
-`python scripts/architecture_picture.py` writes it; a test holds that it is current. Layers come
+`python tests/architecture_picture.py` writes it; `test_architecture.py` holds that it is current. Layers come
 from the import-linter contracts in pyproject.toml, arrows from the import graph, sentences from the
 rooms' docstrings.
 """
