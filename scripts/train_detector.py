@@ -322,10 +322,7 @@ def commit() -> str:
     """The sources' commit, with a plus where they were changed."""
     try:
         run = subprocess.run(
-            ["git", "describe", "--always", "--dirty=+"],
-            capture_output=True,
-            text=True,
-            check=True,
+            ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

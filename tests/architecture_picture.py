@@ -1,8 +1,8 @@
 """Draws docs/architecture.svg: rooms by layer, and the imports between them, read from the code.
 
-`python tests/architecture_picture.py` writes it; `test_architecture.py` holds that it is current. Layers come
-from the import-linter contracts in pyproject.toml, arrows from the import graph, sentences from the
-rooms' docstrings.
+`python tests/architecture_picture.py` writes it; `test_architecture.py` holds that it is current.
+Layers come from the import-linter contracts in pyproject.toml, arrows from the import graph,
+sentences from the rooms' docstrings.
 """
 
 from __future__ import annotations

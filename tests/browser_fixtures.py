@@ -26,14 +26,7 @@ from typing import Any
 import pytest
 from aiohttp import web
 from axe_playwright_python.base import AXE_SCRIPT
-from playwright.sync_api import (
-    Browser,
-    BrowserContext,
-    Page,
-    Playwright,
-    expect,
-    sync_playwright,
-)
+from playwright.sync_api import Browser, BrowserContext, Page, Playwright, expect, sync_playwright
 from web_fakes import DESKTOP
 
 from bikeped.config import WebConfig

@@ -92,10 +92,7 @@ class BoardPose:
 
 
 def true_corners(
-    camera: DrawnCamera,
-    pattern: BoardPattern,
-    pose: BoardPose,
-    bend: BoardBend = FLAT,
+    camera: DrawnCamera, pattern: BoardPattern, pose: BoardPose, bend: BoardBend = FLAT
 ) -> tuple[FloatArray, BoolArray]:
     """Where the corners [n, 2] of a board lie in the picture, by id, and which are seen [n].
 

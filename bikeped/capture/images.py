@@ -95,8 +95,7 @@ def _load(path: Path) -> tuple[bytes | None, ImageArray | None]:
         with silence_opencv():
             picture = (
                 cv2.imdecode(
-                    np.frombuffer(data, np.uint8),
-                    cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION,
+                    np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
                 )
                 if data
                 else None

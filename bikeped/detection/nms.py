@@ -20,11 +20,7 @@ _BLOCK = 192
 
 
 def non_max_suppression(
-    box: Float32Array,
-    score: Float32Array,
-    group: npt.NDArray[Any],
-    iou: float,
-    max_boxes: int,
+    box: Float32Array, score: Float32Array, group: npt.NDArray[Any], iou: float, max_boxes: int
 ) -> IntArray:
     """Indices of the boxes kept, strongest first, ties in input order; at most `max_boxes`.
 
@@ -49,11 +45,7 @@ def non_max_suppression(
 
 
 def vote_boxes(
-    box: Float32Array,
-    score: Float32Array,
-    group: npt.NDArray[Any],
-    keep: IntArray,
-    overlap: float,
+    box: Float32Array, score: Float32Array, group: npt.NDArray[Any], keep: IntArray, overlap: float
 ) -> Float32Array:
     """Box voting: the boxes [k, 4] of `keep` [k], averaged with the boxes that overlap them.
 

@@ -41,11 +41,7 @@ def compose(
     how = cv2.INTER_AREA if fit < 1 else cv2.INTER_LINEAR
     small = np.asarray(cv2.resize(rgb, (pw, ph), interpolation=how), dtype=np.uint8)
     picture = draw_overlay(
-        small,
-        data,
-        scale=pw / (frame_width or w),
-        ground_to_frame=ground_to_frame,
-        banner=False,
+        small, data, scale=pw / (frame_width or w), ground_to_frame=ground_to_frame, banner=False
     )
     out: ImageArray = np.empty((height, width, 3), np.uint8)
     out[:] = INK

@@ -19,9 +19,7 @@ class GroundMapper:
         self._sensor_framing = framing(loaded)
         self.camera = ground_camera(loaded)
         self.table = GroundTable(
-            self.camera,
-            *self._sensor_framing.crop_wh,
-            step_px=loaded.config.camera.table_step_px,
+            self.camera, *self._sensor_framing.crop_wh, step_px=loaded.config.camera.table_step_px
         )
         self._max_range_m = loaded.config.tracking.max_range_m
         self._framings: dict[tuple[int, int], Framing] = {}

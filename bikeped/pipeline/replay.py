@@ -23,12 +23,7 @@ from bikeped.pipeline.feed import RecordedFeed, open_configured
 from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.loop import Loop
-from bikeped.pipeline.replay_outputs import (
-    OVERLAY_SIZE,
-    EventFile,
-    OverlayVideo,
-    ReplaySummary,
-)
+from bikeped.pipeline.replay_outputs import OVERLAY_SIZE, EventFile, OverlayVideo, ReplaySummary
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.pipeline.web_context import Pages
 from bikeped.telemetry.latency import StageTimes

@@ -22,10 +22,7 @@ class Tracker:
     """
 
     def __init__(
-        self,
-        settings: TrackerSettings,
-        speed_window_s: float = 4 / 30,
-        history_length: int = 30,
+        self, settings: TrackerSettings, speed_window_s: float = 4 / 30, history_length: int = 30
     ) -> None:
         self.batch = BatchTracker(settings)
         self._speed_window_s = speed_window_s

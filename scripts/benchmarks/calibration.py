@@ -63,11 +63,7 @@ def _dense(observations: CornerObservations, start: CalibrationState) -> None:
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    from bikeped.lab.calibration.solver.lens_model import (
-        CalibrationState,
-        residuals,
-        rotations,
-    )
+    from bikeped.lab.calibration.solver.lens_model import CalibrationState, residuals, rotations
 
     views = len(observations)
     first = np.concatenate(

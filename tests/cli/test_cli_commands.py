@@ -32,11 +32,7 @@ def validate_events(path: Path) -> list[dict[str, object]]:
 def test_replay_leaves_overlay_events_and_summary(make_clip, small_config, tmp_path, capsys):
     clip, out = make_clip("c.avi", 20), tmp_path / "out"
     assert main(["replay", str(clip), "-c", str(small_config()), "--out", str(out)]) == 0
-    assert sorted(p.name for p in out.iterdir()) == [
-        "events.jsonl",
-        "overlay.mp4",
-        "summary.json",
-    ]
+    assert sorted(p.name for p in out.iterdir()) == ["events.jsonl", "overlay.mp4", "summary.json"]
     assert len(validate_events(out / "events.jsonl")) == 20
     video = cv2.VideoCapture(str(out / "overlay.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 20

@@ -63,12 +63,7 @@ def test_the_fault_table_has_the_texts_that_the_code_writes() -> None:
     feed.newest_s = lambda _: 0.0
     monitor.processed(0.0)
     misfit = Fault("geometry", "camera.frame_size", str(error.value))
-    faults = [
-        *begin,
-        *monitor.faults(9.0),
-        misfit,
-        NOT_REFRESHED,
-    ]
+    faults = [*begin, *monitor.faults(9.0), misfit, NOT_REFRESHED]
     listed = [
         text.removesuffix("...").strip()
         for text in re.findall(r"^\| `([^`]+)` \|", PAGE, re.MULTILINE)

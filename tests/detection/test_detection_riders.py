@@ -86,10 +86,7 @@ def test_a_pedestrian_close_to_a_rider_stays():
 def test_two_riders_abreast_keep_their_own_cycles():
     other, his = moved(BICYCLE, dx=60, dy=10), moved(RIDER, dx=60, dy=10)
     out = join((P, 0.9, RIDER), (P, 0.8, his), (C, 0.7, BICYCLE), (C, 0.6, other))
-    assert [(k, b) for k, _, b in out] == [
-        (C, (300, 215, 480, 400)),
-        (C, (360, 225, 540, 410)),
-    ]
+    assert [(k, b) for k, _, b in out] == [(C, (300, 215, 480, 400)), (C, (360, 225, 540, 410))]
 
 
 def test_one_cycle_has_one_rider():
@@ -138,10 +135,7 @@ def test_the_middle_of_the_person_lies_over_the_cycle():
     # Covered by 0.44 and by 0.56 of the width: only in the second the middle is over the cycle.
     assert [
         k for k, *_ in join((P, 0.8, (458, 215, 508, 390)), (C, 0.7, BICYCLE), overlap=0.3)
-    ] == [
-        P,
-        C,
-    ]
+    ] == [P, C]
     assert [
         k for k, *_ in join((P, 0.8, (452, 215, 502, 390)), (C, 0.7, BICYCLE), overlap=0.3)
     ] == [C]

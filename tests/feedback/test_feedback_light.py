@@ -196,9 +196,7 @@ def test_the_thread_shows_signals_and_close_darkens() -> None:
     assert driver.fault is None
 
 
-def test_the_threads_watchdog_needs_no_help_from_the_loop(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_the_threads_watchdog_needs_no_help_from_the_loop(caplog: pytest.LogCaptureFixture) -> None:
     light = FakeLight()
     driver = LightDriver(light.open, watchdog_s=0.05, fault_blink_hz=10.0)
     driver.start()
@@ -263,9 +261,7 @@ def test_starts_only_once_and_closes_without_a_start() -> None:
     started.close(WAIT_S)
 
 
-def test_simulated_light_logs_colours_but_not_every_flash(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_simulated_light_logs_colours_but_not_every_flash(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     light = SimulatedLight()
     for _ in range(50):

@@ -136,12 +136,7 @@ def test_a_fresh_alert_shows_beside_a_fault_but_is_no_good_frame() -> None:
 
 @given(
     steps=st.lists(
-        st.tuples(
-            st.floats(0, 0.4),
-            st.none() | st.sampled_from(State),
-            st.booleans(),
-        ),
-        max_size=60,
+        st.tuples(st.floats(0, 0.4), st.none() | st.sampled_from(State), st.booleans()), max_size=60
     ),
     hold_s=st.floats(0, 2),
     recover=st.integers(1, 6),

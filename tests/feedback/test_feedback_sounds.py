@@ -11,15 +11,7 @@ import numpy as np
 import pytest
 
 from bikeped.errors import FeedbackError
-from bikeped.feedback.sounds import (
-    RATE_HZ,
-    bell,
-    chime,
-    duration_s,
-    encode_wav,
-    load_wav,
-    make_wav,
-)
+from bikeped.feedback.sounds import RATE_HZ, bell, chime, duration_s, encode_wav, load_wav, make_wav
 from bikeped.types import FloatArray, Sound
 
 

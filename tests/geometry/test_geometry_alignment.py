@@ -54,11 +54,7 @@ def test_four_marks_give_height_and_pitch_back_from_any_start(height, pitch, mod
     found = fit_alignment(start, seen(truth, FOUR)).alignment
     assert found.height_m == pytest.approx(height, abs=1e-5)
     assert found.pitch_deg == pytest.approx(pitch, abs=1e-4)
-    assert (found.radius_px, found.cx, found.cy) == (
-        pytest.approx(1750),
-        CAMERA.cx,
-        CAMERA.cy,
-    )
+    assert (found.radius_px, found.cx, found.cy) == (pytest.approx(1750), CAMERA.cx, CAMERA.cy)
 
 
 def test_forward_and_right_or_distances_and_a_spacing_do_as_well() -> None:

@@ -74,11 +74,7 @@ def plain_ground(camera, u, v):
     """Equations 1 to 5 as the paper prints them; None above the horizon."""
     du, dv = u - camera.cx, v - camera.cy
     theta, phi = plain_theta(camera, math.sqrt(du * du + dv * dv)), math.atan2(dv, du)
-    d = (
-        math.cos(theta),
-        math.sin(theta) * math.cos(phi),
-        -math.sin(theta) * math.sin(phi),
-    )
+    d = (math.cos(theta), math.sin(theta) * math.cos(phi), -math.sin(theta) * math.sin(phi))
     a = math.radians(camera.pitch_deg)
     dx = math.cos(a) * d[0] - math.sin(a) * d[2]
     dy = d[1]

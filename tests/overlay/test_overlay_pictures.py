@@ -18,16 +18,7 @@ from bikeped.overlay import (
     ground_projector,
 )
 from bikeped.overlay.drawing import INK, KIND_COLOUR, SIGNAL_COLOUR
-from bikeped.types import (
-    Colour,
-    Decision,
-    Detections,
-    Kind,
-    PairMetrics,
-    Signal,
-    State,
-    Tracks,
-)
+from bikeped.types import Colour, Decision, Detections, Kind, PairMetrics, Signal, State, Tracks
 
 GREY = np.full((432, 768, 3), 120, np.uint8)
 PAIR = PairMetrics(12, 7, 10.9, 11.2, 0.067, 0.28, 4.3, 1.9, 24.8)

@@ -85,8 +85,7 @@ def found_by(function, config, name="camera"):
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
-    [({"jpeg": b"junk"}, "JPEG"), ({"width": 64}, "other proportions")],
+    ("values", "said"), [({"jpeg": b"junk"}, "JPEG"), ({"width": 64}, "other proportions")]
 )
 def test_a_camera_whose_pictures_are_of_no_use_fails(camera, small_config, values, said):
     camera(**values)

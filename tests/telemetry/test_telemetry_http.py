@@ -42,10 +42,7 @@ async def serve() -> AsyncIterator[Callable[..., Any]]:
 
 
 async def get(url: str, **headers: str) -> tuple[int, str, str]:
-    async with (
-        aiohttp.ClientSession() as session,
-        session.get(url, headers=headers) as response,
-    ):
+    async with aiohttp.ClientSession() as session, session.get(url, headers=headers) as response:
         return response.status, response.headers["Content-Type"], await response.text()
 
 

@@ -420,9 +420,7 @@ async def test_tls_with_a_client_certificate(make_broker, listen, tmp_path):
 async def test_a_broker_that_an_unknown_authority_signed_is_refused(make_broker, tmp_path):
     make_certificates(tmp_path)
     broker = make_broker(
-        "allow_anonymous true",
-        f"certfile {tmp_path}/server.crt",
-        f"keyfile {tmp_path}/server.key",
+        "allow_anonymous true", f"certfile {tmp_path}/server.crt", f"keyfile {tmp_path}/server.key"
     )
     other = tmp_path / "other"
     other.mkdir()

@@ -31,11 +31,7 @@ def scene(drawn: Scene, tmp_path: Path) -> Scene:
         if file.suffix in (".yaml", ".json"):
             (tmp_path / file.name).write_bytes(file.read_bytes())
     return Scene(
-        tmp_path / "config.yaml",
-        drawn.jpeg,
-        drawn.crosses_px,
-        drawn.distances_m,
-        drawn.rights_m,
+        tmp_path / "config.yaml", drawn.jpeg, drawn.crosses_px, drawn.distances_m, drawn.rights_m
     )
 
 

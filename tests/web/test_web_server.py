@@ -74,10 +74,7 @@ async def test_pages_share_a_frame_with_one_navigation_in_a_fixed_order(base):
     assert headers["Content-Type"] == "text/html; charset=utf-8"
     assert headers["Cache-Control"] == "no-store"
     nav = re.findall(r'<a href="(/\w*)"( aria-current="page")?>([^<]+)</a>', text)
-    assert nav == [
-        ("/align", "", "Align"),
-        ("/testbench", ' aria-current="page"', "Test bench"),
-    ]
+    assert nav == [("/align", "", "Align"), ("/testbench", ' aria-current="page"', "Test bench")]
     assert "<title>&lt;Bench&gt; · bikeped</title>" in text
     assert "{{" not in text
     _, _, text = await get(f"{base}/align")

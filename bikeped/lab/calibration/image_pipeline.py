@@ -16,17 +16,8 @@ from bikeped.cores import cores
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing
 from bikeped.lab.calibration import refusals
-from bikeped.lab.calibration.board_view import (
-    BoardPattern,
-    BoardView,
-    DetectedBoards,
-    RefusedImage,
-)
-from bikeped.lab.calibration.capture.images import (
-    CalibrationImage,
-    check_image_sizes,
-    images_hash,
-)
+from bikeped.lab.calibration.board_view import BoardPattern, BoardView, DetectedBoards, RefusedImage
+from bikeped.lab.calibration.capture.images import CalibrationImage, check_image_sizes, images_hash
 from bikeped.lab.calibration.corners.board_check import DetectedBoard, rms_shift_px
 from bikeped.lab.calibration.corners.board_detector import check_pattern, detect_board
 from bikeped.lab.calibration.refusals import BoardRefusedError

@@ -22,10 +22,7 @@ DEFAULT_FOLDER = Path("calibration-pictures")
 
 
 def live_pictures(
-    images: Sequence[Path],
-    pattern: BoardPattern,
-    loaded: LoadedConfig,
-    screen: Console,
+    images: Sequence[Path], pattern: BoardPattern, loaded: LoadedConfig, screen: Console
 ) -> tuple[Path, ...]:
     """Guides a person before the configured camera; returns the folder of the pictures.
 

@@ -15,12 +15,7 @@ from bikeped.config import load_decision
 from bikeped.errors import BikepedError, ConfigError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.cli.conformance_shared import SuiteRun, suite_options
-from bikeped.lab.cli.governance_tables import (
-    count,
-    print_comparison,
-    print_gates,
-    print_register,
-)
+from bikeped.lab.cli.governance_tables import count, print_comparison, print_gates, print_register
 
 if TYPE_CHECKING:
     from bikeped.config import DecisionConfig

@@ -29,9 +29,7 @@ FPS = 30
     help="Folder for the clip, the overlay video, the events and the summary.",
 )
 @click.option(
-    "--seconds",
-    type=FiniteRange(min=0.1),
-    help="Run only the first seconds of the crossing.",
+    "--seconds", type=FiniteRange(min=0.1), help="Run only the first seconds of the crossing."
 )
 @web_option
 @json_option

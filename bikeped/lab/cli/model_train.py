@@ -59,11 +59,7 @@ from bikeped.lab.cli.model_shared import data_argument, data_files, images_optio
     "crops around them (the small network only).",
 )
 @click.option(
-    "--batch",
-    type=click.IntRange(1, 1024),
-    default=8,
-    show_default=True,
-    help="Pictures per step.",
+    "--batch", type=click.IntRange(1, 1024), default=8, show_default=True, help="Pictures per step."
 )
 @click.option(
     "--device",

@@ -56,10 +56,7 @@ def end_to_end_result(
         },
         "stages": [_stage(rungs, i) for i in range(len(rungs))],
         "by_scenario": {
-            name: {
-                "scripted": scripted.scenario_dict(i),
-                "pixels": whole.scenario_dict(i),
-            }
+            name: {"scripted": scripted.scenario_dict(i), "pixels": whole.scenario_dict(i)}
             for i, name in enumerate(suite.names)
         },
         "detection": {
@@ -79,10 +76,7 @@ def end_to_end_result(
 def within_goal(rungs: Sequence[AblationStep]) -> bool:
     """Whether sensitivity and specificity from pixels are within the goal of the scripted run's."""
     first, last = rungs[0].metrics, rungs[-1].metrics
-    pairs = (
-        (first.sensitivity, last.sensitivity),
-        (first.specificity, last.specificity),
-    )
+    pairs = ((first.sensitivity, last.sensitivity), (first.specificity, last.specificity))
     # Without actionable frames (or without safe ones) there is nothing to compare.
     return all(math.isnan(a) or abs(a - b) <= GOAL for a, b in pairs)
 

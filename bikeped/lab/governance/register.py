@@ -105,11 +105,7 @@ class RiskRegister:
     scenarios: list[dict[str, Any]]
 
     def as_dict(self) -> dict[str, Any]:
-        return {
-            "suite_hash": self.suite_hash,
-            "hazards": self.hazards,
-            "scenarios": self.scenarios,
-        }
+        return {"suite_hash": self.suite_hash, "hazards": self.hazards, "scenarios": self.scenarios}
 
     def tables(self) -> tuple[ResultTable, ResultTable]:
         """Named hazards, then scenarios."""

@@ -79,13 +79,7 @@ class Appearance:
         )
 
 
-def person(
-    size_m: Size,
-    style: Appearance,
-    travel_m: float,
-    moving: bool,
-    sides: int = 8,
-) -> Mesh:
+def person(size_m: Size, style: Appearance, travel_m: float, moving: bool, sides: int = 8) -> Mesh:
     """A pedestrian agent's mesh in its own axes: a wheelchair user, a child or an adult.
 
     `travel_m`: distance travelled, which poses the legs; `sides`: of a limb's cross-section.

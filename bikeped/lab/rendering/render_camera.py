@@ -85,9 +85,7 @@ class Rays:
 
 
 def scene_camera(
-    loaded: LoadedConfig,
-    size: tuple[int, int] = (1920, 1080),
-    pose: CameraPose = DEFAULT_POSE,
+    loaded: LoadedConfig, size: tuple[int, int] = (1920, 1080), pose: CameraPose = DEFAULT_POSE
 ) -> SceneCamera:
     """The configured camera, for pictures of `size`: any scaled copy of the sensor's picture.
 

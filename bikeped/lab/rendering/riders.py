@@ -19,12 +19,7 @@ _TAIL: Rgb = (230, 30, 26)
 
 
 def rider(
-    kind: str,
-    size_m: Size,
-    style: Appearance,
-    paint: int,
-    travel_m: float,
-    sides: int = 8,
+    kind: str, size_m: Size, style: Appearance, paint: int, travel_m: float, sides: int = 8
 ) -> Mesh:
     """A cyclist or motorcycle agent's mesh in its own axes."""
     if kind == "motorcycle":

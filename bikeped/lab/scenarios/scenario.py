@@ -25,15 +25,7 @@ SIZES_M: dict[str, tuple[float, float, float]] = {
     "bus": (12.0, 2.5, 3.0),
     "truck": (7.0, 2.5, 2.8),
 }
-HAZARDS = (
-    "safe",
-    "standard",
-    "high-speed",
-    "accessibility",
-    "multi-agent",
-    "edge",
-    "non-linear",
-)
+HAZARDS = ("safe", "standard", "high-speed", "accessibility", "multi-agent", "edge", "non-linear")
 #: A scenario runs on for this long after the last waypoint (definitions, section 4).
 TAIL_S = 0.5
 _MAX_BYTES = 1_000_000
@@ -77,11 +69,7 @@ class Agent:
         part = np.clip((t - t0) / (t1 - t0), 0.0, 1.0)[:, None]
         xy = self.path[segment, 1:] * (1 - part) + self.path[segment + 1, 1:] * part
         heading = self._headings()[segment]
-        return (
-            np.where(present[:, None], xy, np.nan),
-            np.where(present, heading, np.nan),
-            present,
-        )
+        return (np.where(present[:, None], xy, np.nan), np.where(present, heading, np.nan), present)
 
     def _headings(self) -> FloatArray:
         step = np.diff(self.path[:, 1:], axis=0)
@@ -184,10 +172,7 @@ def parse_scenario(text: str, source: str) -> Scenario:
         name=name.strip(),
         hazard=_choice(top.get("hazard", "standard"), HAZARDS, source, "hazard"),
         expected=_choice(
-            top.get("expected", "warning"),
-            ("idle", "safe", "warning", "alert"),
-            source,
-            "expected",
+            top.get("expected", "warning"), ("idle", "safe", "warning", "alert"), source, "expected"
         ),
         vehicle=_choice(top.get("vehicle", "bicycle"), ("bicycle", "ebike"), source, "vehicle"),
         agents=agents,

@@ -161,8 +161,7 @@ class Suite:
 
 
 def compare(
-    suite: Suite,
-    configurations: Mapping[str, DecisionConfig] = CONFIGURATIONS,
+    suite: Suite, configurations: Mapping[str, DecisionConfig] = CONFIGURATIONS
 ) -> dict[str, dict[str, Metrics]]:
     """Metrics of every configuration, with and without localisation error."""
     return {

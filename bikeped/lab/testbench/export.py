@@ -71,10 +71,7 @@ def render_report(
     suite = work.full_suite(settings_in_force(loaded))
     named = configurations(loaded)
     decision = loaded.config.decision
-    found = {
-        "run": run_table(suite, decision),
-        "compare": compare_table(suite, loaded, named),
-    }
+    found = {"run": run_table(suite, decision), "compare": compare_table(suite, loaded, named)}
     name = next(n for n, d in named.items() if d == decision)
     plays = []
     for index in range(len(suite.scenarios)):

@@ -67,13 +67,7 @@ def coverage(camera: GroundCamera, pose: CameraPose) -> dict[str, Any]:
     outlines in the plan (null where no ground is visible), and the camera's pose."""
     bearing = np.linspace(-np.pi, np.pi, _COVER_BEARINGS, endpoint=False)
     reach = np.concatenate([np.arange(0.1, 5, 0.1), np.arange(5, _COVER_REACH_M + 0.1, 0.25)])
-    ground = np.stack(
-        [
-            np.cos(bearing)[:, None] * reach,
-            np.sin(bearing)[:, None] * reach,
-        ],
-        -1,
-    )
+    ground = np.stack([np.cos(bearing)[:, None] * reach, np.sin(bearing)[:, None] * reach], -1)
     _, seen = camera.project(ground.reshape(-1, 2))
     seen = np.asarray(seen).reshape(len(bearing), len(reach))
     some = np.atleast_1d(seen.any(axis=1))

@@ -141,10 +141,7 @@ class Packer:
         return _Window(sample, box, scale, blocks)
 
     def _furniture_window(
-        self,
-        pool: Sequence[Sample],
-        things: dict[str, list[_Target]],
-        random: np.random.Generator,
+        self, pool: Sequence[Sample], things: dict[str, list[_Target]], random: np.random.Generator
     ) -> _Window:
         """A window at a random spot of a fixture: first the kind, then one of it."""
         kind = _one_of(sorted(things), random)

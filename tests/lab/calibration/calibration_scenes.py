@@ -42,13 +42,7 @@ def boards(
     """`count` boards that cover the circle; `seed` draws the noise, not the poses."""
     poses = spread_poses(drawn, PATTERN, count, seed=1, span_deg=span_deg)
     return draw_views(
-        drawn,
-        PATTERN,
-        poses,
-        noise_px=noise_px,
-        outlier_share=outlier_share,
-        bend=bend,
-        seed=seed,
+        drawn, PATTERN, poses, noise_px=noise_px, outlier_share=outlier_share, bend=bend, seed=seed
     )
 
 

@@ -62,11 +62,7 @@ def close(found: np.ndarray, expected: np.ndarray) -> None:
 )
 @settings(max_examples=25, deadline=None)
 def test_derivatives_are_those_of_the_projection(
-    projection: Projection,
-    theta: float,
-    phi: float,
-    tilt: tuple[float, ...],
-    k: tuple[float, ...],
+    projection: Projection, theta: float, phi: float, tilt: tuple[float, ...], k: tuple[float, ...]
 ) -> None:
     state = a_state(projection, theta, phi, tilt, k)
     found = jacobian(state, FLAT)

@@ -8,13 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import PATTERN, boards, camera, found
-from synthetic_boards import (
-    BoardPose,
-    DrawnCamera,
-    draw_views,
-    spread_poses,
-    turn,
-)
+from synthetic_boards import BoardPose, DrawnCamera, draw_views, spread_poses, turn
 
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens

@@ -61,10 +61,7 @@ patterns = st.sampled_from([BoardPattern(8, 6), BoardPattern(7, 6), BoardPattern
 )
 @settings(max_examples=60, deadline=None)
 def test_ids_are_right_or_none(
-    pattern: BoardPattern,
-    turns: int,
-    shift: tuple[int, int],
-    holes: list[tuple[int, int]],
+    pattern: BoardPattern, turns: int, shift: tuple[int, int], holes: list[tuple[int, int]]
 ) -> None:
     """Whatever is hidden of a board in a clear picture, its corners get their own numbers; only an
     outer line of which fewer than three corners are seen may cost them."""
@@ -74,9 +71,7 @@ def test_ids_are_right_or_none(
     lines = (keep[0], keep[-1], keep[:, 0], keep[:, -1])
     try:
         answer = assign_corner_ids(
-            picture(pattern.columns, pattern.rows),
-            pattern,
-            grid_of(pattern, keep, turns, shift),
+            picture(pattern.columns, pattern.rows), pattern, grid_of(pattern, keep, turns, shift)
         )
     except BoardRefusedError:
         assert any(line.sum() < LEAST_IN_LINE for line in lines)

@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 from board_render import RenderStyle, draw_picture
 from calibration_scenes import refusal_of
-from synthetic_boards import (
-    BoardPose,
-    DrawnCamera,
-    spread_poses,
-    true_corners,
-    turn,
-)
+from synthetic_boards import BoardPose, DrawnCamera, spread_poses, true_corners, turn
 
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Lens
@@ -210,10 +204,7 @@ def test_a_smaller_pattern_than_the_board_is_refused() -> None:
     truth = true_corners(camera(), PATTERN, pose)[0].reshape(6, 8, 2)
     from bikeped.lab.calibration.corners.board_check import check_board
 
-    for part, pattern in (
-        (truth[:, :7], BoardPattern(7, 6)),
-        (truth[1:, 1:], BoardPattern(7, 5)),
-    ):
+    for part, pattern in ((truth[:, :7], BoardPattern(7, 6)), (truth[1:, 1:], BoardPattern(7, 5))):
         reason = refusal_of(check_board, picture, pattern, part.reshape(-1, 2))
         assert "more inner corners" in reason
 

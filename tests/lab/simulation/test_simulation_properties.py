@@ -30,8 +30,7 @@ def turned(scenario, angle):
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
     return with_paths(
-        scenario,
-        lambda path: np.column_stack([path[:, 0], (path[:, 1:] - AT) @ turn.T + AT]),
+        scenario, lambda path: np.column_stack([path[:, 0], (path[:, 1:] - AT) @ turn.T + AT])
     )
 
 

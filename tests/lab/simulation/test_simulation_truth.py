@@ -6,13 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.lab.scenarios.scenario import (
-    SIZES_M,
-    Agent,
-    Scenario,
-    bundled_folder,
-    load_scenarios,
-)
+from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenarios
 from bikeped.lab.simulation.truth import GroundTruthSettings, compute_ground_truth, with_ttc_bound
 
 INF = math.inf

@@ -63,10 +63,7 @@ def test_the_picture_lies_where_the_lens_says():
     assert seen.all()
     assert uv == pytest.approx(np.array([[200, 200], [300, 200], [200, 200 - down]]))
     # Turned to the right, up, and clockwise.
-    for change, expected in (
-        ({"yaw_deg": 45.0}, [300, 200]),
-        ({"pitch_deg": 45.0}, [200, 100]),
-    ):
+    for change, expected in (({"yaw_deg": 45.0}, [300, 200]), ({"pitch_deg": 45.0}, [200, 100])):
         uv, _ = straight(**change).forward(np.array([[160.0, 120]]), PICTURE)
         assert uv[0] == pytest.approx(expected)
     uv, _ = straight(roll_deg=90.0).forward(np.array([[160.0, 0]]), PICTURE)

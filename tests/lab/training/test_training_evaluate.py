@@ -18,12 +18,7 @@ from bikeped.errors import DataSetError, DetectorError
 from bikeped.lab.rendering.dataset import write_dataset
 from bikeped.lab.simulation.perception import AREA_SCALE
 from bikeped.lab.training.coco import read_coco
-from bikeped.lab.training.evaluate import (
-    EvaluationSettings,
-    ModelUnderTest,
-    evaluate,
-    load_models,
-)
+from bikeped.lab.training.evaluate import EvaluationSettings, ModelUnderTest, evaluate, load_models
 from bikeped.lab.training.evaluation_figures import draw_evaluation, evaluation_rows
 from bikeped.lab.training.ground_truth import INPUT_PX
 

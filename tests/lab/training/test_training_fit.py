@@ -17,18 +17,9 @@ from bikeped.errors import DataSetError, DetectorError  # noqa: E402
 from bikeped.lab.training.coco import read_coco, read_picture  # noqa: E402
 from bikeped.lab.training.crops import CropSettings  # noqa: E402
 from bikeped.lab.training.export import export_network, export_weights  # noqa: E402
-from bikeped.lab.training.fit import (  # noqa: E402
-    FitSettings,
-    fit,
-    learning_rate,
-)
+from bikeped.lab.training.fit import FitSettings, fit, learning_rate  # noqa: E402
 from bikeped.lab.training.packing import PackSettings  # noqa: E402
-from bikeped.lab.training.weights import (  # noqa: E402
-    SmallDetector,
-    is_small,
-    load_weights,
-    save_weights,
-)
+from bikeped.lab.training.weights import SmallDetector, is_small, load_weights, save_weights  # noqa: E402
 
 CROPS = CropSettings(view=(160, 96), window=(96, 64), light=0, cover=0)
 PACK = PackSettings(side=128, squares=2, pool=4)

@@ -107,10 +107,7 @@ def measure_coverage(
 
 
 def corner_counts(
-    sectors: Sequence[CircleSector],
-    uv_px: FloatArray,
-    lens: Lens,
-    centre_px: tuple[float, float],
+    sectors: Sequence[CircleSector], uv_px: FloatArray, lens: Lens, centre_px: tuple[float, float]
 ) -> IntArray:
     """[sectors] how many of the corners `uv_px` [n, 2] lie in each sector."""
     offset = uv_px - np.array(centre_px)

@@ -69,9 +69,7 @@ def local_map(
     middle = uv_px.mean(0)
     factor = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ (uv_px - middle))
     return LocalMap(
-        factor[:, 0] + middle,
-        factor[:, 1:3].transpose(0, 2, 1),
-        factor[:, 3:6].transpose(0, 2, 1),
+        factor[:, 0] + middle, factor[:, 1:3].transpose(0, 2, 1), factor[:, 3:6].transpose(0, 2, 1)
     )
 
 

@@ -13,11 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.geometry.lens import unit_radius, unit_radius_slope
-from bikeped.lab.calibration.solver.lens_model import (
-    PLAIN,
-    CalibrationState,
-    radial_factor,
-)
+from bikeped.lab.calibration.solver.lens_model import PLAIN, CalibrationState, radial_factor
 from bikeped.types import FloatArray
 
 

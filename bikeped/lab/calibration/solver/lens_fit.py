@@ -8,11 +8,7 @@ import numpy as np
 
 from bikeped.geometry import Lens
 from bikeped.geometry.lens import unit_radius
-from bikeped.lab.calibration.solver.bundle_adjustment import (
-    AdjustmentResult,
-    ShapePrior,
-    adjust,
-)
+from bikeped.lab.calibration.solver.bundle_adjustment import AdjustmentResult, ShapePrior, adjust
 from bikeped.lab.calibration.solver.cross_validation import held_out_residuals
 from bikeped.lab.calibration.solver.jacobian import jacobian
 from bikeped.lab.calibration.solver.lens_model import (

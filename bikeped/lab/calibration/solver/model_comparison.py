@@ -125,8 +125,7 @@ def recommend_model(comparison: ModelComparison) -> Recommendation:
     best = min(known, key=lambda f: errors[f.name])
     equal = [f for f in known if errors[f.name] <= errors[best.name] * (1 + EQUAL_SHARE)]
     chosen = min(
-        equal,
-        key=lambda f: (f.model.terms, FISHEYE.index(f.model.projection), errors[f.name]),
+        equal, key=lambda f: (f.model.terms, FISHEYE.index(f.model.projection), errors[f.name])
     )
     error = f"{errors[chosen.name]:.3f} px"
     text = f"{chosen.name} predicts pictures that did not help to fit it to {error}"

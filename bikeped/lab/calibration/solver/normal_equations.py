@@ -99,10 +99,7 @@ class NormalEquations:
 
 
 def normal_equations(
-    jac: Jacobian,
-    error: FloatArray,
-    weight: FloatArray,
-    shape_basis: FloatArray | None = None,
+    jac: Jacobian, error: FloatArray, weight: FloatArray, shape_basis: FloatArray | None = None
 ) -> NormalEquations:
     """Blocks for residuals `error` [V, C, 2] weighted by `weight` [V, C].
 

@@ -17,11 +17,7 @@ from bikeped.lab.calibration.board_view import DetectedBoards, RefusedImage
 from bikeped.lab.calibration.refusals import contradicts_others
 from bikeped.lab.calibration.solver.board_shape import align_numbering
 from bikeped.lab.calibration.solver.bundle_adjustment import AdjustmentResult, adjust
-from bikeped.lab.calibration.solver.initial_guess import (
-    FISHEYE,
-    first_guess,
-    median_errors_px,
-)
+from bikeped.lab.calibration.solver.initial_guess import FISHEYE, first_guess, median_errors_px
 from bikeped.lab.calibration.solver.lens_model import (
     CalibrationState,
     CornerObservations,
