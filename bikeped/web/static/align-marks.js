@@ -2,7 +2,13 @@
 
 import { $, el, setText } from "/static/ui.js";
 
-const number = (input) => (input.value.trim() === "" ? null : Number(input.value));
+// A field for a length in metres; `change` gets the number, or null where there is none.
+function lengthInput(attributes, value, change) {
+  const input = el("input", { type: "number", step: "any", max: 1000, ...attributes });
+  if (value !== null && value !== undefined) input.value = value;
+  input.addEventListener("input", () => change(input.validity.valid && input.value.trim() !== "" ? Number(input.value) : null));
+  return input;
+}
 
 export class MarkList {
   // `on`: changed(), chosen(mark), removed(mark), betweenChanged()
@@ -36,10 +42,8 @@ export class MarkList {
   row(mark) {
     const input = (name, label, value, least) => {
       const id = `${name}-${mark.id}`;
-      const field = el("input", { type: "number", id, step: "any", min: least, max: 1000, inputmode: least === null ? null : "decimal", autocomplete: "off" });
-      if (value !== null && value !== undefined) field.value = value;
-      field.addEventListener("input", () => {
-        mark[name] = field.validity.valid ? number(field) : null;
+      const field = lengthInput({ id, min: least, inputmode: least === null ? null : "decimal", autocomplete: "off" }, value, (metres) => {
+        mark[name] = metres;
         this.on.changed();
       });
       field.addEventListener("focus", () => this.on.chosen(mark));
@@ -71,10 +75,8 @@ export class MarkList {
         });
         return select;
       };
-      const field = el("input", { type: "number", step: "any", min: 0.01, max: 1000, inputmode: "decimal", "aria-label": "Distance between them, m" });
-      if (pair.distance_m !== null) field.value = pair.distance_m;
-      field.addEventListener("input", () => {
-        pair.distance_m = field.validity.valid ? number(field) : null;
+      const field = lengthInput({ min: 0.01, inputmode: "decimal", "aria-label": "Distance between them, m" }, pair.distance_m, (metres) => {
+        pair.distance_m = metres;
         this.on.betweenChanged();
       });
       const remove = el("button", { type: "button", "aria-label": "Delete this distance", onclick: () => {

@@ -212,8 +212,7 @@ export class View {
       stage.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, [x, y]);
       still = fingers.size === 1;
-      const pin = event.target.closest?.(".pin");
-      const mark = pin && this.marks.find((m) => String(m.id) === pin.dataset.id);
+      const mark = this.markOf(event);
       if (mark && fingers.size === 1) {
         held = { mark, x, y, u: mark.u, v: mark.v, moved: false };
         this.on.chosen(mark);
@@ -272,17 +271,21 @@ export class View {
     }, { passive: false });
     stage.addEventListener("keydown", (event) => this.key(event));
     stage.addEventListener("focusin", (event) => {
-      const pin = event.target.closest?.(".pin");
-      const mark = pin && this.marks.find((m) => String(m.id) === pin.dataset.id);
+      const mark = this.markOf(event);
       if (mark) this.on.chosen(mark);
     });
+  }
+
+  // The mark whose button got the event.
+  markOf(event) {
+    const pin = event.target.closest?.(".pin");
+    return pin && this.marks.find((mark) => String(mark.id) === pin.dataset.id);
   }
 
   key(event) {
     if (!this.size || event.altKey || event.metaKey) return;
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    const pin = event.target.closest?.(".pin");
-    const mark = pin && this.marks.find((m) => String(m.id) === pin.dataset.id);
+    const mark = this.markOf(event);
     if (way && mark) {
       const step = event.shiftKey ? 10 : event.ctrlKey ? 0.1 : 1;
       this.move(mark, mark.u + way[0] * step, mark.v + way[1] * step);
