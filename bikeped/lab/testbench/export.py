@@ -149,7 +149,7 @@ def _page(
         "default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; "
         f"style-src {_hash(style)}; script-src {_hash(theme)} {_hash(script)}"
     )
-    # Inside a script element only "<" can end it: as \\u003c it is the same JSON.
+    # "<" could end the script element; \\u003c is the same JSON.
     data_json = msgspec.json.encode(data).decode().replace("<", "\\u003c")
     return render(
         "report.html",
@@ -160,11 +160,11 @@ def _page(
         theme=Markup(theme),
         script=Markup(script),
         data=Markup(data_json),
-        verdict=Markup(verdict_html(found)),
-        tested=Markup(tested_html(found, provenance)),
-        tables=Markup("".join(table_html(t) for result in found.values() for t in result.tables)),
-        risks=Markup(risks_html(found, provenance)),
-        provenance=Markup(definitions_html(provenance)),
+        verdict=verdict_html(found),
+        tested=tested_html(found, provenance),
+        tables=Markup("").join(table_html(t) for result in found.values() for t in result.tables),
+        risks=risks_html(found, provenance),
+        provenance=definitions_html(provenance),
         command=command,
         decision=json.dumps(msgspec.to_builtins(loaded.config.decision)),
     )
@@ -179,10 +179,11 @@ _EXPORT = re.compile(r"^export ((?:async )?(?:const|let|function|class)) ([\w$]+
 
 
 def bundle(modules: Mapping[str, str]) -> str:
-    """Modules as one plain script, for a page from the disk may not import files.
+    """JavaScript modules as one script, because a page opened from the disk cannot import files.
 
-    Each becomes a function that gives what it exports; `modules` by name, in the order of need.
-    Knows `import {a, b} from "/static/x.js";` and `export const|let|function|class name`.
+    Each module becomes a function that returns its exports; `modules` by name, in import order.
+    Supports `import {a, b} from "/static/x.js";` and `export const|let|function|class name`;
+    ValueError for other forms.
     """
     parts = ['"use strict";', "const modules = {};"]
     for name, text in modules.items():
