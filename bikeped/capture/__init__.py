@@ -1,7 +1,7 @@
-"""Where pictures come from: cameras, recordings and folders in, `Frame`s out.
+"""Frame sources: cameras, network streams, recordings and image folders.
 
-`open_source` picks the source by its text; `FrameGrabber` keeps the newest frame of a live one;
-`PacedSource` plays a recording as a live camera would; `JpegDecoder` decodes at the scale needed.
+`open_source` chooses the source by its text; `FrameGrabber` keeps the newest frame of a live one;
+`PacedSource` plays a recording in real time; `JpegDecoder` decodes at a reduced scale.
 """
 
 from bikeped.capture.base import FrameSource

@@ -1,4 +1,4 @@
-"""The newest frame of a live source, read in a thread that reopens it when it breaks."""
+"""The newest frame of a live source, read in a thread that reopens it after a failure."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ _log = logging.getLogger(__name__)
 _Result = TypeVar("_Result")
 
 
-def backoff_s(failures: int, first_s: float, most_s: float) -> float:
-    """Pause before the next attempt, after `failures` (1 or more) in a row: doubled each time."""
-    return float(min(first_s * 2.0 ** min(failures - 1, 60), most_s))
+def backoff_s(failures: int, first_s: float, max_s: float) -> float:
+    """Pause before the next attempt after `failures` (at least 1) in a row: doubles each time."""
+    return float(min(first_s * 2.0 ** min(failures - 1, 60), max_s))
 
 
 class FrameGrabber:
     """Reads a live source in its own thread and keeps only the newest frame.
 
-    `open_source` opens a fresh source; it is called in the thread, first at `start` and again after
-    an error, after `restart` and when the source delivers nothing newer for `stale_after_s` (a read
-    that has not returned at all cannot be ended: see `hung_s`). Attempts are `first_pause_s` apart,
-    doubled up to `most_pause_s`, and from the start again once a source has delivered for
-    `healthy_after_s`. A source that ends (None: a paced recording) stops the thread: see `ended`.
+    `open_source` is called in the thread, at `start` and again after an error, after `restart` and
+    when the source delivers no newer frame for `stale_after_s` (a read that does not return cannot
+    be ended: see `hung_s`). Attempts are `first_pause_s` apart, doubled up to `max_pause_s`, and
+    reset once a source has delivered for `healthy_after_s`. The end of a source (a paced recording)
+    ends the thread: see `ended`.
 
-    Frame numbers count on across restarts. `next` is for one consumer; everything else may be
-    called from any thread. Times are seconds on `clock`.
+    Frame numbers continue across restarts. `next` is for one consumer; everything else may be used
+    from any thread. Times are seconds on `clock`.
     """
 
     def __init__(
@@ -45,13 +45,13 @@ class FrameGrabber:
         clock: Callable[[], float] = time.monotonic,
         stale_after_s: float = 2.0,
         first_pause_s: float = 0.25,
-        most_pause_s: float = 8.0,
+        max_pause_s: float = 8.0,
         healthy_after_s: float = 1.0,
     ) -> None:
         self._open_source = open_source
         self._clock = clock
         self._stale_after_s = stale_after_s
-        self._first_pause_s, self._most_pause_s = first_pause_s, most_pause_s
+        self._first_pause_s, self._max_pause_s = first_pause_s, max_pause_s
         self._healthy_after_s = healthy_after_s
         self._stop = threading.Event()
         self._restart = threading.Event()
@@ -61,11 +61,10 @@ class FrameGrabber:
         self._latest: Frame | None = None
         self._taken = True
         self._waiter: tuple[asyncio.AbstractEventLoop, asyncio.Event] | None = None
-        self._frames = 0
-        self._dropped = 0
-        self._opened = 0
-        self._error: CaptureError | None = None
-        self._ended = False
+        self.frames = 0  #: that arrived
+        self.dropped = 0  #: that a newer one replaced before they were taken
+        self.error: CaptureError | None = None  #: why there are no frames; None since a frame came
+        self.ended = False  #: whether the source has come to its end
         self._arrived_s: float | None = None
         self._busy_since_s: float | None = None
 
@@ -76,7 +75,7 @@ class FrameGrabber:
     def stop(self, timeout_s: float = 2.0) -> bool:
         """Ends the thread, waiting up to `timeout_s`: call it outside the event loop.
 
-        False when it hangs in the source and had to be left behind (it is a daemon thread).
+        False when the thread hangs in the source (it is a daemon thread).
         """
         self._stop.set()
         self._wake()
@@ -85,67 +84,31 @@ class FrameGrabber:
         return not self._thread.is_alive()
 
     def restart(self) -> None:
-        """Asks for a fresh source, once the read under way has returned."""
+        """Reopens the source once the current read has returned."""
         self._restart.set()
 
     async def next(self, timeout_s: float) -> Frame | None:
-        """The newest frame that was not taken yet; waits for one up to `timeout_s`.
+        """The newest frame not taken yet; waits for one up to `timeout_s`.
 
-        None when none came in time, after `stop`, and at the end of a recording.
+        None after the timeout, after `stop`, and at the end of a recording.
         """
         wake = asyncio.Event()
         with self._lock:
             if self._waiter is not None:
                 raise RuntimeError("FrameGrabber.next has one consumer, and it is waiting already")
             frame = self._take()
-            if frame is not None or self._ended or self._stop.is_set():
+            if frame is not None or self.ended or self._stop.is_set():
                 return frame
             self._waiter = (asyncio.get_running_loop(), wake)
         try:
             await asyncio.wait_for(wake.wait(), timeout_s)
         except asyncio.TimeoutError:
-            pass  # a frame may have come at this very moment, so look once more
+            pass  # a frame may have come meanwhile: checked below
         finally:
             with self._lock:
                 self._waiter = None
         with self._lock:
             return self._take()
-
-    @property
-    def latest(self) -> Frame | None:
-        """The newest frame, taken or not; it counts as neither taken nor dropped by this."""
-        with self._lock:
-            return self._latest
-
-    @property
-    def frames(self) -> int:
-        """Frames that arrived."""
-        with self._lock:
-            return self._frames
-
-    @property
-    def dropped(self) -> int:
-        """Frames that a newer one replaced before they were taken."""
-        with self._lock:
-            return self._dropped
-
-    @property
-    def restarts(self) -> int:
-        """How often the source was opened again with success."""
-        with self._lock:
-            return max(self._opened - 1, 0)
-
-    @property
-    def error(self) -> CaptureError | None:
-        """Why there are no frames; None from the first frame of a fresh source on."""
-        with self._lock:
-            return self._error
-
-    @property
-    def ended(self) -> bool:
-        """Whether the source has come to its end."""
-        with self._lock:
-            return self._ended
 
     def age_s(self, now_s: float) -> float:
         """Time since the last frame arrived; infinite before the first."""
@@ -153,40 +116,36 @@ class FrameGrabber:
             return math.inf if self._arrived_s is None else now_s - self._arrived_s
 
     def hung_s(self, now_s: float) -> float:
-        """For how long the call into the source under way (open, read, close) has not returned."""
+        """How long the current call into the source (open, read, close) has been running."""
         with self._lock:
             return 0.0 if self._busy_since_s is None else max(now_s - self._busy_since_s, 0.0)
 
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                self._one_source()
+                self._read_source()
             except CaptureError as error:
                 self._failed(error)
             except Exception as error:  # noqa: BLE001  (the thread must outlive a bug)
                 _log.exception("the camera's source failed")
                 self._failed(CaptureError(f"camera.source: {type(error).__name__}: {error}"))
-            with self._lock:
-                if self._ended:
-                    break
+            if self.ended:
+                break
             if self._failures and not self._stop.is_set():
-                self._stop.wait(backoff_s(self._failures, self._first_pause_s, self._most_pause_s))
+                self._stop.wait(backoff_s(self._failures, self._first_pause_s, self._max_pause_s))
         self._wake()
 
-    def _one_source(self) -> None:
-        """Opens a source and reads it until it breaks (raises), ends, or a fresh one is wanted."""
+    def _read_source(self) -> None:
+        """Opens a source and reads it until it fails (raises), ends, or `restart` is called."""
         self._restart.clear()
         source = self._timed(self._open_source)
         try:
             opened_s = fresh_s = self._clock()
-            with self._lock:
-                self._opened += 1
             last_captured_s = -math.inf
             while not (self._stop.is_set() or self._restart.is_set()):
                 frame = self._timed(source.read)
                 if frame is None:
-                    with self._lock:
-                        self._ended = True
+                    self.ended = True
                     return
                 now_s = self._clock()
                 if frame.captured_s > last_captured_s:
@@ -196,7 +155,7 @@ class FrameGrabber:
                         self._failures = 0
                 elif now_s - fresh_s > self._stale_after_s:
                     raise CaptureError(
-                        f"{source.name}: no newer picture for {now_s - fresh_s:.1f} s; "
+                        f"{source.name}: no newer frame for {now_s - fresh_s:.1f} s; "
                         "is it still plugged in?"
                     )
         finally:
@@ -214,16 +173,16 @@ class FrameGrabber:
     def _publish(self, frame: Frame, now_s: float) -> None:
         with self._lock:
             if not self._taken:
-                self._dropped += 1
-            self._latest = dataclasses.replace(frame, number=self._frames)
+                self.dropped += 1
+            self._latest = dataclasses.replace(frame, number=self.frames)
             self._taken = False
-            self._frames += 1
+            self.frames += 1
             self._arrived_s = now_s
-            self._error = None
+            self.error = None
         self._wake()
 
     def _take(self) -> Frame | None:
-        """The newest frame if it is new; the lock must be held."""
+        """The newest frame if it was not taken yet; the lock must be held."""
         if self._taken:
             return None
         self._taken = True
@@ -232,9 +191,8 @@ class FrameGrabber:
     def _failed(self, error: CaptureError) -> None:
         self._failures += 1
         with self._lock:
-            known, self._error = self._error, error
-        # A camera that is gone for a month is not a line every few seconds: what is new, and then
-        # the 2nd, 4th, 8th ... time.
+            known, self.error = self.error, error
+        # An unplugged camera must not fill the log: a new error, then the 2nd, 4th, 8th ... time.
         if str(known) != str(error) or self._failures & (self._failures - 1) == 0:
             _log.warning("%s (attempt %d follows)", error, self._failures + 1)
 
@@ -246,4 +204,4 @@ class FrameGrabber:
             try:
                 loop.call_soon_threadsafe(wake.set)
             except RuntimeError:
-                self._waiter = None  # the loop is closed: nobody waits any more
+                self._waiter = None  # the loop is closed

@@ -1,4 +1,4 @@
-"""A folder of pictures, or one picture, shown as a recording."""
+"""A folder of images, or one image, as a recording."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ IMAGE_SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp"}
 
 
 class ImageSource(FrameSource):
-    """The pictures of `path` in natural order (2.jpg before 10.jpg), one every 1/`fps` seconds.
+    """The images of `path` in natural order (2.jpg before 10.jpg), one every 1/`fps` seconds.
 
-    JPEG files are handed on undecoded, and turned by no EXIF tag. All pictures must have the size
+    JPEG files are passed on undecoded; EXIF orientation is ignored. All images must have the size
     of the first. `captured_s` is media time. Raises CaptureError, naming the file.
     """
 
@@ -31,7 +31,7 @@ class ImageSource(FrameSource):
         folder = Path(path)
         self.name = str(path)
         if not usable_fps(fps):
-            raise CaptureError(f"camera.fps: {fps} pictures a second cannot be shown; try 30")
+            raise CaptureError(f"camera.fps: {fps} frames per second is not possible; try 30")
         self.fps = fps
         try:
             self._paths = image_paths(folder)
@@ -39,7 +39,7 @@ class ImageSource(FrameSource):
             raise CaptureError(f"{self.name}: cannot be read: {error.strerror}") from error
         if not self._paths:
             raise CaptureError(
-                f"{self.name}: holds no pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
+                f"{self.name}: holds no images ({', '.join(sorted(IMAGE_SUFFIXES))})"
             )
         self._number = 0
         self.width, self.height = _size(*_load(self._paths[0]), self._paths[0])
@@ -51,12 +51,12 @@ class ImageSource(FrameSource):
         jpeg, rgb = _load(path)
         try:
             width, height = _size(jpeg, rgb, path)
-        except CaptureError:  # a damaged JPEG is for the decoder to refuse, as from a camera
+        except CaptureError:  # the decoder refuses a damaged JPEG, as from a camera
             width, height = self.width, self.height
         if (width, height) != (self.width, self.height):
             raise CaptureError(
-                f"{path}: is {width}x{height} pixels, but the first picture is "
-                f"{self.width}x{self.height}; keep one size a folder"
+                f"{path}: is {width}x{height} pixels, but the first image is "
+                f"{self.width}x{self.height}; use one size per folder"
             )
         frame = Frame(self._number, self._number / self.fps, width, height, jpeg, rgb)
         self._number += 1
@@ -67,7 +67,7 @@ class ImageSource(FrameSource):
 
 
 def image_paths(path: Path) -> list[Path]:
-    """The pictures of a folder in natural order; a file is the only one of itself."""
+    """The images of a folder in natural order; for a file, the file."""
     if not path.is_dir():
         return [path]
     found = [
@@ -79,7 +79,7 @@ def image_paths(path: Path) -> list[Path]:
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sorts numbers in names by value; the name itself decides between `1.jpg` and `01.jpg`."""
+    """Sort key: numbers in names by value; then the name itself (`1.jpg` and `01.jpg`)."""
     parts = re.split(r"([0-9]+)", name.casefold())
     return [(0, int(p), "") if p[:1].isdigit() and p.isascii() else (1, 0, p) for p in parts], name
 
@@ -91,20 +91,15 @@ def _load(path: Path) -> tuple[bytes | None, ImageArray | None]:
         raise CaptureError(f"{path}: cannot be read: {error.strerror}") from error
     if path.suffix.lower() in JPEG_SUFFIXES:
         return data, None
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         with silence_opencv():
-            picture = (
-                cv2.imdecode(
-                    np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-                )
-                if data
-                else None
-            )
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error as error:
-        raise CaptureError(f"{path}: is no picture ({error.err}); remove it") from error
-    if picture is None:
-        raise CaptureError(f"{path}: is no picture that can be decoded; remove it")
-    return None, as_rgb(np.asarray(picture, np.uint8))
+        raise CaptureError(f"{path}: is not an image ({error.err}); remove it") from error
+    if image is None:
+        raise CaptureError(f"{path}: is not an image that can be decoded; remove it")
+    return None, as_rgb(np.asarray(image, np.uint8))
 
 
 def _size(jpeg: bytes | None, rgb: ImageArray | None, path: Path) -> tuple[int, int]:

@@ -1,7 +1,6 @@
-"""JPEG decoding into reused buffers, at the scale that is needed, by libjpeg-turbo.
+"""JPEG decoding into reused buffers, at a reduced scale, with libjpeg-turbo.
 
-Strict: a picture that is cut off or damaged, as far as libjpeg notices, is refused, never handed on
-half grey.
+Strict: images that libjpeg finds truncated or damaged are refused, never returned half grey.
 """
 
 from __future__ import annotations
@@ -15,26 +14,26 @@ from bikeped.types import ImageArray
 
 SOI = b"\xff\xd8"
 EOI = b"\xff\xd9"
-# A damaged header can promise 65535 x 65535 pixels, 12 GB; no camera in reach has more than this.
+# A damaged header can claim 65535 x 65535 pixels, 12 GB; no supported camera has more than this.
 MAX_PIXELS = 1 << 27
-# libjpeg scales by eighths, but 5/8 to 7/8 take longer than the full size (measured), so: at most
-# half. A decoded picture is then the full one, or 4/8, 3/8, 2/8 or 1/8 of it.
+# libjpeg scales by eighths, but 5/8 to 7/8 take longer than the full size (measured). Images are
+# therefore decoded at the full size or at 4/8, 3/8, 2/8 or 1/8 of it.
 SMALLEST_REDUCTION = 2
 
 JpegBytes = bytes | bytearray | memoryview
 
 
 def read_size(data: JpegBytes) -> tuple[int, int]:
-    """(width, height) in pixels, from the header alone; CaptureError when there is none."""
+    """(width, height) in pixels from the header; CaptureError when there is none."""
     return _header_size(data, 0, 0)
 
 
 class JpegDecoder:
-    """Decodes into `buffers` buffers in turn, each grown when needed and never shrunk.
+    """Decodes into `buffers` buffers in turn, which grow when needed.
 
-    The picture that `decode` returns is a view into one of them: valid until the `buffers`-th call
-    after, so a consumer in another thread may hold the newest `buffers` - 1 while one is decoded.
-    One decoder serves one thread. `max_pixels` bounds the memory that a damaged header can claim.
+    The image that `decode` returns is a view into one of them, valid until the `buffers`-th later
+    call: another thread may hold the newest `buffers` - 1 while one is decoded. One decoder serves
+    one thread. `max_pixels` limits the memory that a damaged header can claim.
     """
 
     def __init__(self, buffers: int = 3, *, max_pixels: int = MAX_PIXELS) -> None:
@@ -45,10 +44,10 @@ class JpegDecoder:
         self._max_pixels = max_pixels
 
     def decode(self, data: JpegBytes, min_width: int = 0, min_height: int = 0) -> ImageArray:
-        """Height x width x 3 RGB, not smaller than asked, at the least work.
+        """RGB [height, width, 3] uint8 at the smallest scale of at least the given size.
 
-        With neither size asked, or more than the picture has: the full size. With one asked, the
-        other is free. Raises CaptureError for anything but a whole JPEG.
+        A size of 0 is not constrained; both 0, or larger than the image: the full size. Raises
+        CaptureError for anything but a complete JPEG.
         """
         if min_width > 0 or min_height > 0:
             # libjpeg scales only when both are given.
@@ -70,9 +69,9 @@ class JpegDecoder:
                 np.uint8,
             )
         except (ValueError, RuntimeError, MemoryError) as error:
-            # Nobody holds this buffer: a row of damaged pictures must not run into those in use.
+            # This buffer is free again: a series of damaged images must not reach those in use.
             self._turn -= 1
-            raise CaptureError(f"JPEG: damaged or cut off ({error})") from error
+            raise CaptureError(f"JPEG: damaged or truncated ({error})") from error
 
     def _next_buffer(self, size: int) -> npt.NDArray[np.uint8]:
         self._turn = (self._turn + 1) % len(self._buffers)
@@ -91,5 +90,5 @@ def _header_size(data: JpegBytes, min_width: int, min_height: int) -> tuple[int,
             strict=True,
         )
     except (ValueError, RuntimeError) as error:
-        raise CaptureError(f"JPEG: no picture header ({error})") from error
+        raise CaptureError(f"JPEG: no image header ({error})") from error
     return int(width), int(height)

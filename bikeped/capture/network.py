@@ -1,7 +1,7 @@
 """A camera on the network: RTSP, or Motion JPEG and other streams over HTTP.
 
-OpenCV shows no capture time for these, so `captured_s` is the arrival, after the camera's own
-encoding and the network: give what is known of that delay as `latency.camera_offset_s`.
+OpenCV gives no capture time for these, so `captured_s` is the arrival time, after encoding and
+network: set the known part of that delay as `latency.camera_offset_s`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ READ_TIMEOUT_MS = 5000
 
 
 class NetworkSource(FrameSource):
-    """A live stream by its address. `fps` is the rate assumed where the stream names none.
+    """A live stream by its address. `fps` is assumed where the stream has no frame rate.
 
-    A stream that ends, breaks or says nothing for 5 s raises CaptureError.
+    A stream that ends, fails or sends nothing for 5 s raises CaptureError.
     """
 
     live = True
@@ -42,7 +42,7 @@ class NetworkSource(FrameSource):
         self._reader = FfmpegReader(
             address,
             self.name,
-            mend="is the camera on, and are address, user and password right?",
+            remedy="is the camera on, and are address, user and password right?",
             params=[
                 int(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC),
                 OPEN_TIMEOUT_MS,
@@ -57,12 +57,12 @@ class NetworkSource(FrameSource):
         self._number = 0
 
     def read(self) -> Frame:
-        picture = self._reader.read()
-        if picture is None:
-            raise CaptureError(f"{self.name}: the stream broke off; is the camera still on?")
+        image = self._reader.read()
+        if image is None:
+            raise CaptureError(f"{self.name}: the stream ended; is the camera still on?")
         arrived_s = self._clock() if self._opened_s is None else self._opened_s
         self._opened_s = None
-        frame = Frame(self._number, arrived_s, self.width, self.height, picture.jpeg, picture.rgb)
+        frame = Frame(self._number, arrived_s, self.width, self.height, image.jpeg, image.rgb)
         self._number += 1
         return frame
 
@@ -71,7 +71,7 @@ class NetworkSource(FrameSource):
 
 
 def without_password(address: str) -> str:
-    """The address as it may stand in a log: user, password and query left out."""
+    """The address without user, password and query, for logs."""
     try:
         parts = urlsplit(address)
     except ValueError:

@@ -1,7 +1,7 @@
-"""OpenCV's VideoCapture as this package uses it: opening, raw packets, colours.
+"""OpenCV's VideoCapture as used here: opening, undecoded packets, colours.
 
-`RawImage` is one picture as OpenCV gave it. `FfmpegReader` is the common part of recordings and
-network streams: Motion JPEG is handed on undecoded, everything else as RGB.
+`FfmpegReader` is common to recordings and network streams: Motion JPEG stays undecoded, everything
+else becomes RGB.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LOG_LEVEL_ERROR = 2  # OpenCV's
 
 
 class Capture(Protocol):
-    """The part of cv2.VideoCapture in use: the seam at which tests put a fake device."""
+    """The part of cv2.VideoCapture in use; tests put a fake device here."""
 
     def isOpened(self) -> bool: ...  # noqa: N802  (OpenCV's name)
     def get(self, prop: int, /) -> float: ...
@@ -41,38 +41,37 @@ OpenCapture = Callable[..., Capture]
 
 @dataclass(frozen=True)
 class RawImage:
-    """One picture: `jpeg` or `rgb` is set, as in Frame."""
+    """One image as OpenCV returned it: `jpeg` or `rgb` is set, as in Frame."""
 
     jpeg: bytes | None
     rgb: ImageArray | None
-    media_s: float  #: the container's time stamp, seconds; meaningless for some containers
+    media_s: float  #: the container's time stamp, seconds; not valid for all containers
 
 
-def as_rgb(picture: ImageArray) -> ImageArray:
-    """Height x width x 3 RGB of what OpenCV decoded (BGR or grey)."""
-    grey = picture.ndim == 2 or picture.shape[2] == 1
+def as_rgb(image: ImageArray) -> ImageArray:
+    """RGB [height, width, 3] of an OpenCV image (BGR or grey)."""
+    grey = image.ndim == 2 or image.shape[2] == 1
     code = cv2.COLOR_GRAY2RGB if grey else cv2.COLOR_BGR2RGB
-    return np.asarray(cv2.cvtColor(picture, code), np.uint8)
+    return np.asarray(cv2.cvtColor(image, code), np.uint8)
 
 
 def fourcc_text(code: float) -> str:
-    """`MJPG` of the number that OpenCV holds it in; an empty text where there is none."""
+    """The four characters (`MJPG`) of OpenCV's codec number; empty where it has none."""
     if not math.isfinite(code) or code <= 0:
         return ""
     return int(code).to_bytes(8, "little")[:4].decode("latin-1").rstrip("\0 ")
 
 
 def usable_fps(fps: float) -> bool:
-    """Whether a container's rate can be one; OpenCV gives 0, negative or NaN for none."""
+    """Whether a frame rate is valid; OpenCV gives 0, negative or NaN for none."""
     return math.isfinite(fps) and 0.0 < fps <= MAX_FPS
 
 
 @contextlib.contextmanager
 def silence_opencv() -> Iterator[None]:
-    """Keeps OpenCV and FFmpeg from writing to standard error.
+    """Keeps OpenCV and FFmpeg from writing to standard error; errors are reported in our own line.
 
-    What is wrong with a file is said by our own one line. A person's own setting is left alone;
-    FFmpeg's is read once, by the first capture of the process.
+    The variable OPENCV_LOG_LEVEL has priority. FFmpeg reads its level once per process.
     """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     # The functions are in cv2 itself up to OpenCV 4, and in cv2.utils.logging from 5 on.
@@ -87,14 +86,14 @@ def silence_opencv() -> Iterator[None]:
 
 
 class FfmpegReader:
-    """The pictures of one file or address, through OpenCV's FFmpeg backend.
+    """The images of one file or address, through OpenCV's FFmpeg backend.
 
-    The first picture is read at once: it proves that the source holds pictures, and shows whether
-    its packets are whole JPEGs of the promised size (interlaced ones hold two, of half the height).
-    If not, the source is opened again and decoded here. Packets may lack the Huffman tables, as AVI
-    allows: libjpeg-turbo, and so every decoder in use, then takes the standard ones.
+    The first image is read on opening: it shows that the source has images, and whether its packets
+    are complete JPEGs of the stated size (interlaced ones hold two, of half the height). If not,
+    the source is opened again and decoded by FFmpeg. Packets may lack the Huffman tables, as AVI
+    allows: libjpeg-turbo then uses the standard ones.
 
-    `label` stands for the source in messages, `mend` ends them. Raises CaptureError.
+    `label` names the source in messages and `remedy` ends them. Raises CaptureError.
     """
 
     def __init__(
@@ -102,11 +101,11 @@ class FfmpegReader:
         address: str,
         label: str,
         *,
-        mend: str,
+        remedy: str,
         params: Sequence[int] = (),
         open_capture: OpenCapture = cv2.VideoCapture,
     ) -> None:
-        self._address, self._label, self._mend = address, label, mend
+        self._address, self._label, self._remedy = address, label, remedy
         # No hardware decoding: two runs over one recording must give the same bytes.
         self._params = [
             int(cv2.CAP_PROP_HW_ACCELERATION),
@@ -115,7 +114,7 @@ class FfmpegReader:
         ]
         self._open_capture = open_capture
         self._capture = self._open()
-        self._raw = self._ask_raw()
+        self._raw = self._request_raw()
         first = self._read()
         if self._raw and not self._whole_jpeg(first):
             self._capture.release()
@@ -124,19 +123,19 @@ class FfmpegReader:
             first = self._read()
         if first is None:
             self._capture.release()
-            raise CaptureError(f"{label}: holds no picture that can be read; {mend}")
+            raise CaptureError(f"{label}: has no image that can be read; {remedy}")
         self._first: RawImage | None = first
         self.fps = self._capture.get(cv2.CAP_PROP_FPS)
-        self.promised = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.expected_frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.width, self.height = self._size(first)
 
     @property
     def raw(self) -> bool:
-        """Whether pictures come as JPEG."""
+        """Whether images come as JPEG."""
         return self._raw
 
     def read(self) -> RawImage | None:
-        """The next picture, or None: the end of a file, or a stream that broke off."""
+        """The next image, or None at the end of a file or stream."""
         if self._first is not None:
             first, self._first = self._first, None
             return first
@@ -153,46 +152,46 @@ class FfmpegReader:
                 capture = self._open_capture(self._address, cv2.CAP_FFMPEG, self._params)
                 opened = capture.isOpened()
         except cv2.error as error:
-            raise self._broken("opened", error) from error
+            raise self._failure("opened", error) from error
         if not opened:
-            raise CaptureError(f"{self._label}: cannot be opened; {self._mend}")
+            raise CaptureError(f"{self._label}: cannot be opened; {self._remedy}")
         return capture
 
-    def _broken(self, what: str, error: cv2.error) -> CaptureError:
-        # An address may hold a password, which must not get into a message.
+    def _failure(self, what: str, error: cv2.error) -> CaptureError:
+        # An address may hold a password, which must not appear in a message.
         why = str(error.err).replace(self._address, self._label)
-        return CaptureError(f"{self._label}: cannot be {what} ({why}); {self._mend}")
+        return CaptureError(f"{self._label}: cannot be {what} ({why}); {self._remedy}")
 
-    def _ask_raw(self) -> bool:
-        # A turned picture must be turned back, which only OpenCV's decoding does.
+    def _request_raw(self) -> bool:
+        # Only OpenCV's own decoding applies a rotation tag.
         if self._capture.get(cv2.CAP_PROP_ORIENTATION_META) not in (0.0, -1.0):
             return False
         if fourcc_text(self._capture.get(cv2.CAP_PROP_FOURCC)) not in JPEG_TAGS:
             return False
         return bool(self._capture.set(cv2.CAP_PROP_FORMAT, -1))
 
-    def _whole_jpeg(self, picture: RawImage | None) -> bool:
-        if picture is None or picture.jpeg is None or not picture.jpeg.startswith(SOI):
+    def _whole_jpeg(self, image: RawImage | None) -> bool:
+        if image is None or image.jpeg is None or not image.jpeg.startswith(SOI):
             return False
         try:
-            return read_size(picture.jpeg) == self._promised_size()
+            return read_size(image.jpeg) == self._stated_size()
         except CaptureError:
             return False
 
-    def _promised_size(self) -> tuple[int, int]:
+    def _stated_size(self) -> tuple[int, int]:
         get = self._capture.get
         return int(get(cv2.CAP_PROP_FRAME_WIDTH)), int(get(cv2.CAP_PROP_FRAME_HEIGHT))
 
-    def _size(self, picture: RawImage) -> tuple[int, int]:
-        if picture.rgb is None:
-            return self._promised_size()
-        return picture.rgb.shape[1], picture.rgb.shape[0]
+    def _size(self, image: RawImage) -> tuple[int, int]:
+        if image.rgb is None:
+            return self._stated_size()
+        return image.rgb.shape[1], image.rgb.shape[0]
 
     def _read(self) -> RawImage | None:
         try:
             ok, data = self._capture.read()
         except cv2.error as error:
-            raise self._broken("decoded", error) from error
+            raise self._failure("decoded", error) from error
         if not ok or data is None:
             return None
         media_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0

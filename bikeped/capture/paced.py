@@ -1,4 +1,4 @@
-"""A recording at the pace of a live camera."""
+"""A recording played in real time."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from bikeped.types import Frame
 
 
 class PacedSource(FrameSource):
-    """Gives each frame of `source` when its media time has come, the first one at once.
+    """Returns each frame of `source` at its media time, the first one immediately.
 
     `captured_s` is rebased on `clock` (monotonic seconds), spaced as in the recording. No frame is
-    left out here; where reading is slower than the recording, frames come late and look their age.
+    dropped here: where reading is slower than the recording, frames come late.
     """
 
     live = True

@@ -1,4 +1,4 @@
-"""Which source a `camera.source` means."""
+"""Opens the source that `camera.source` names."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def open_source(
 ) -> FrameSource:
     """Opens what `config_source` names.
 
-    A path below /dev or a plain number is a V4L2 camera, asked for `width` x `height` pixels, `fps`
-    and `fourcc`; an rtsp, rtsps, http or https address is a live stream; a folder holds pictures,
-    shown in natural order at `fps`, and so does a single picture; any other file is a video, whose
-    own size and rate count. Raises CaptureError, one line, when it cannot be opened.
+    A path below /dev or a number is a V4L2 camera, set to `width` x `height` pixels, `fps` and
+    `fourcc`; an rtsp, rtsps, http or https address is a live stream; a folder of images, or one
+    image, is played at `fps`; any other file is a video with its own size and rate. Raises
+    CaptureError when it cannot be opened.
     """
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]*)://", config_source)
     if scheme is not None:

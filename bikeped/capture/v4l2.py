@@ -1,10 +1,10 @@
 """A camera at /dev/videoN, through OpenCV's V4L2 backend.
 
-With CAP_PROP_CONVERT_RGB off OpenCV hands on the Motion JPEG as the camera wrote it, and
-CAP_PROP_POS_MSEC is the kernel's time stamp of the buffer. Not run on a real camera yet: it was
-written from OpenCV's documented behaviour and is tested against a fake at cv2.VideoCapture.
+With CAP_PROP_CONVERT_RGB off OpenCV returns the camera's Motion JPEG undecoded, and
+CAP_PROP_POS_MSEC is the kernel's time stamp of the buffer. Not run on a real camera yet: written
+from OpenCV's documentation and tested against a fake at cv2.VideoCapture.
 
-A read that the driver never answers cannot be ended from here; `FrameGrabber.hung_s` shows it.
+A read that the driver never answers cannot be ended from here; see `FrameGrabber.hung_s`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from bikeped.types import Frame, ImageArray
 _log = logging.getLogger(__name__)
 
 JPEG_FORMATS = frozenset({"MJPG", "JPEG"})
-# A stamp older than this, or in the future, is not from the monotonic clock.
+# A time stamp older than this, or in the future, is not from the monotonic clock.
 MAX_STAMP_AGE_S = 2.0
 # OpenCV repeats its last buffer, without waiting, after some unplugs.
 MAX_REPEATING_S = 1.0
@@ -85,18 +85,16 @@ class V4l2Source(FrameSource):
         while True:
             ok, data = self._grab()
             if not ok or data is None or data.size == 0:
-                raise CaptureError(f"{self.name}: gave no picture; is it still plugged in?")
+                raise CaptureError(f"{self.name}: returned no image; is it still plugged in?")
             stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
-            picture = trim(data.tobytes()) if self._raw else np.asarray(data, np.uint8)
-            if not self._repeated(stamp_ms, picture):
-                return self._frame(stamp_ms, picture)
+            image = trim(data.tobytes()) if self._raw else np.asarray(data, np.uint8)
+            if not self._repeated(stamp_ms, image):
+                return self._frame(stamp_ms, image)
             now_s = self._clock()
             if repeating_since_s is None:
                 repeating_since_s = now_s
             elif now_s - repeating_since_s > MAX_REPEATING_S:
-                raise CaptureError(
-                    f"{self.name}: repeats its last picture; is it still plugged in?"
-                )
+                raise CaptureError(f"{self.name}: repeats its last image; is it still plugged in?")
             self._sleep(REPEAT_PAUSE_S)
 
     def close(self) -> None:
@@ -114,7 +112,7 @@ class V4l2Source(FrameSource):
         return capture
 
     def _set_up(self, fps: float, fourcc: str) -> float:
-        """Asks for format, size and rate, in this order; the rate that was granted."""
+        """Sets format, size and rate, in this order; returns the granted rate."""
         capture = self._capture
         code = cv2.VideoWriter.fourcc(fourcc[0], fourcc[1], fourcc[2], fourcc[3])
         capture.set(cv2.CAP_PROP_FOURCC, code)
@@ -138,14 +136,12 @@ class V4l2Source(FrameSource):
                 f"camera.fourcc to one that `v4l2-ctl -d {self.name} --list-formats-ext` shows"
             )
         if self._raw and not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0):
-            raise CaptureError(
-                f"{self.name}: OpenCV cannot hand on its JPEGs; update opencv-python"
-            )
+            raise CaptureError(f"{self.name}: OpenCV cannot return its JPEGs; update opencv-python")
         rate = capture.get(cv2.CAP_PROP_FPS)
         if not usable_fps(rate):
             return fps
         if abs(rate - fps) > 0.05 * fps:
-            _log.warning("%s: grants %.3g pictures a second, not %.3g", self.name, rate, fps)
+            _log.warning("%s: grants %.3g frames per second, not %.3g", self.name, rate, fps)
         return rate
 
     def _grab(self) -> tuple[bool, ImageArray | None]:
@@ -154,38 +150,38 @@ class V4l2Source(FrameSource):
         except cv2.error as error:
             raise CaptureError(f"{self.name}: cannot be read ({error.err})") from error
 
-    def _repeated(self, stamp_ms: float, picture: bytes | ImageArray) -> bool:
-        """Whether this is the last buffer once more: same stamp and same bytes."""
-        last, self._last = self._last, (stamp_ms, picture)
+    def _repeated(self, stamp_ms: float, image: bytes | ImageArray) -> bool:
+        """Whether this is the last buffer again: same time stamp and same bytes."""
+        last, self._last = self._last, (stamp_ms, image)
         if last is None or last[0] != stamp_ms:
             return False
-        if isinstance(picture, bytes):
-            return picture == last[1]
-        return np.array_equal(picture, last[1])
+        if isinstance(image, bytes):
+            return image == last[1]
+        return np.array_equal(image, last[1])
 
-    def _frame(self, stamp_ms: float, picture: bytes | ImageArray) -> Frame:
+    def _frame(self, stamp_ms: float, image: bytes | ImageArray) -> Frame:
         if self._number == 0:
-            self._check_size(picture)
+            self._check_size(image)
         now_s = self._clock()
         captured_s = stamp_ms / 1000.0
-        # Not a stamp of the monotonic clock, or one that stands still: the arrival must do.
+        # Not from the monotonic clock, or not increasing: use the arrival time.
         if not (0.0 <= now_s - captured_s <= MAX_STAMP_AGE_S and captured_s > self._last_s):
             captured_s = now_s
         self._last_s = captured_s
-        jpeg, rgb = (picture, None) if isinstance(picture, bytes) else (None, as_rgb(picture))
+        jpeg, rgb = (image, None) if isinstance(image, bytes) else (None, as_rgb(image))
         frame = Frame(self._number, captured_s, self.width, self.height, jpeg, rgb)
         self._number += 1
         return frame
 
-    def _check_size(self, picture: bytes | ImageArray) -> None:
-        """The pictures themselves must have the size that was granted."""
-        if isinstance(picture, bytes):
+    def _check_size(self, image: bytes | ImageArray) -> None:
+        """Checks that the images have the granted size."""
+        if isinstance(image, bytes):
             try:
-                size = read_size(picture)
+                size = read_size(image)
             except CaptureError:
-                return  # a damaged first picture is the decoder's matter
+                return  # the decoder refuses a damaged image
         else:
-            size = picture.shape[1], picture.shape[0]
+            size = image.shape[1], image.shape[0]
         if size != (self.width, self.height):
             raise CaptureError(
                 f"{self.name}: grants {self.width}x{self.height} but sends {size[0]}x{size[1]}; "
@@ -194,10 +190,9 @@ class V4l2Source(FrameSource):
 
 
 def trim(data: bytes) -> bytes:
-    """The JPEG without what drivers leave behind it in the buffer.
+    """The JPEG without the driver's padding behind it.
 
-    Searched from the end, so that it costs no more than the padding is long. Without an end marker
-    the bytes stay as they are, and the decoder refuses them.
+    Without an end marker the bytes stay as they are, and the decoder refuses them.
     """
     if data.endswith(EOI):
         return data

@@ -1,8 +1,8 @@
 """Recorded video.
 
-Motion JPEG (AVI, MKV, MOV, MP4) is handed on packet by packet, so that a 4K recording costs one
-JPEG decoding, at the scale that is needed. Other codecs are decoded by FFmpeg, in software. Two
-runs over one file give the same bytes and times.
+Motion JPEG (AVI, MKV, MOV, MP4) is passed on packet by packet, so that a frame is decoded once, at
+the scale that the detector needs. Other codecs are decoded by FFmpeg, in software. Two runs over
+one file give the same bytes and times.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from bikeped.types import Frame
 
 _log = logging.getLogger(__name__)
 
-# A container's frame count may be estimated from its length; less than this share is a cut file.
+# A container's frame count may be an estimate; a file with less than this share is truncated.
 COMPLETE_SHARE = 0.95
 
 
 class VideoSource(FrameSource):
     """A video file. `captured_s` is media time in seconds, strictly increasing.
 
-    It is the container's time stamp where that increases, and one frame period after the frame
-    before where it does not. Raises CaptureError for a missing, broken or empty file and for one
+    It is the container's time stamp where that increases, else the previous frame's plus one frame
+    period. Raises CaptureError for a missing, broken or empty file and for one
     without a frame rate.
     """
 
@@ -36,13 +36,13 @@ class VideoSource(FrameSource):
 
     def __init__(self, path: Path | str, *, open_capture: OpenCapture = cv2.VideoCapture) -> None:
         self.name = str(path)
-        mend = (
-            "is it a whole video file? `ffprobe` says what is in it, and "
+        remedy = (
+            "is it a complete video file? `ffprobe` says what is in it, and "
             "`ffmpeg -i IN -c copy OUT.mkv` repairs some"
         )
         if not Path(path).is_file():
             raise CaptureError(f"{self.name}: no such file; set camera.source to a video")
-        self._reader = FfmpegReader(self.name, self.name, mend=mend, open_capture=open_capture)
+        self._reader = FfmpegReader(self.name, self.name, remedy=remedy, open_capture=open_capture)
         self.width, self.height = self._reader.width, self._reader.height
         self.fps = self._reader.fps
         self._number = 0
@@ -54,20 +54,15 @@ class VideoSource(FrameSource):
                 "`ffmpeg -r 30 -i IN -c copy OUT.mkv` writes one"
             )
 
-    @property
-    def undecoded(self) -> bool:
-        """Whether frames come as JPEG."""
-        return self._reader.raw
-
     def read(self) -> Frame | None:
-        picture = self._reader.read()
-        if picture is None:
+        image = self._reader.read()
+        if image is None:
             self._report_end()
             return None
-        captured_s = picture.media_s
+        captured_s = image.media_s
         if not (math.isfinite(captured_s) and captured_s > self._last_s):
             captured_s = self._last_s + 1.0 / self.fps if self._number else 0.0
-        frame = Frame(self._number, captured_s, self.width, self.height, picture.jpeg, picture.rgb)
+        frame = Frame(self._number, captured_s, self.width, self.height, image.jpeg, image.rgb)
         self._number += 1
         self._last_s = captured_s
         return frame
@@ -76,11 +71,7 @@ class VideoSource(FrameSource):
         self._reader.close()
 
     def _report_end(self) -> None:
-        promised = self._reader.promised
-        if self._number < COMPLETE_SHARE * promised:
-            _log.warning(
-                "%s: ends after %d of %.0f frames; is the file cut off?",
-                self.name,
-                self._number,
-                promised,
-            )
+        expected = self._reader.expected_frames
+        if self._number < COMPLETE_SHARE * expected:
+            text = "%s: ends after %d of %.0f frames; is the file truncated?"
+            _log.warning(text, self.name, self._number, expected)

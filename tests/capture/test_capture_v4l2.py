@@ -232,7 +232,7 @@ def test_an_opencv_that_keeps_the_raw_bytes_is_refused():
 def test_another_rate_is_taken_as_granted_and_said(caplog, granted, fps, said):
     with caplog.at_level(logging.WARNING):
         assert _open(FakeCamera(CAP_PROP_FPS=granted)).fps == fps
-    assert ("grants 15 pictures a second" in caplog.text) == said
+    assert ("grants 15 frames per second" in caplog.text) == said
 
 
 def test_a_busy_device_a_missing_one_and_a_wrong_fourcc_are_told_apart(tmp_path):

@@ -82,7 +82,7 @@ def test_the_video(refused, small_config, make_clip, tmp_path):
     assert "none.avi" in refused("replay", tmp_path / "none.avi", "-c", config)
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "holds no pictures" in refused("replay", empty, "-c", config)
+    assert "holds no images" in refused("replay", empty, "-c", config)
     text = tmp_path / "text.avi"
     text.write_text("this is no video\n" * 100)
     assert "text.avi" in refused("replay", text, "-c", config)
