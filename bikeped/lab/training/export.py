@@ -10,7 +10,7 @@ import io
 import json
 import tempfile
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,35 +18,11 @@ import torch
 
 from bikeped import __version__
 from bikeped.errors import DetectorError
-from bikeped.files import write_whole
 from bikeped.lab.training.network import STRIDES, ExportModule
-from bikeped.lab.training.onnx_file import compare, with_metadata
+from bikeped.lab.training.onnx_file import ExportSummary, write_onnx
 from bikeped.lab.training.weights import SmallDetector, is_small, load_weights
 
 _OPSET = 17
-
-
-@dataclass(frozen=True)
-class ExportSummary:
-    """The file, and how much its output differs from PyTorch's."""
-
-    path: Path
-    bytes: int
-    names: tuple[str, ...]
-    size: tuple[int, int]
-    box_difference_px: float
-    score_difference: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "model": str(self.path),
-            "bytes": self.bytes,
-            "names": list(self.names),
-            "size": list(self.size),
-            "largest_box_difference_px": self.box_difference_px,
-            "largest_score_difference": self.score_difference,
-        }
 
 
 def export_weights(weights: Path, out: Path) -> ExportSummary:
@@ -62,8 +38,7 @@ def export_network(detector: SmallDetector, out: Path) -> ExportSummary:
     """
     width, height = detector.size
     whole = ExportModule(detector.network.eval()).eval()
-    generator = torch.Generator().manual_seed(0)
-    picture = torch.rand((1, 3, height, width), generator=generator)
+    picture = torch.rand((1, 3, height, width), generator=torch.Generator().manual_seed(0))
     file = io.BytesIO()
     with warnings.catch_warnings():
         # The exporter that needs nothing but PyTorch is called deprecated since PyTorch 2.9.
@@ -78,26 +53,15 @@ def export_network(detector: SmallDetector, out: Path) -> ExportSummary:
             output_names=["output0"],
             dynamic_axes={"images": {2: "height", 3: "width"}, "output0": {2: "cells"}},
         )
-    content = with_metadata(
-        file.getvalue(),
-        {
-            "author": f"bikeped {__version__}",
-            "task": "detect",
-            "names": repr(dict(enumerate(detector.names))),
-            "imgsz": repr([height, width]),
-            "stride": str(STRIDES[-1]),
-            "bikeped": json.dumps(detector.facts, sort_keys=True),
-        },
-    )
-    box = score = 0.0
     # A second size shows that the trace has not fixed the first one.
-    for shown in (picture, picture[:, :, : max(STRIDES[-1], height // 2 // 32 * 32)]):
-        with torch.no_grad():
-            expected = whole(shown).numpy()
-        apart = compare(content, shown.contiguous().numpy(), expected, str(out))
-        box, score = max(box, apart[0]), max(score, apart[1])
-    write_whole(out, content)
-    return ExportSummary(out, len(content), detector.names, detector.size, box, score)
+    shown = (picture, picture[:, :, : max(STRIDES[-1], height // 2 // 32 * 32)].contiguous())
+    with torch.no_grad():
+        outputs = [(part.numpy(), whole(part).numpy()) for part in shown]
+    facts = json.dumps(detector.facts, sort_keys=True)
+    author = f"bikeped {__version__}"
+    return write_onnx(
+        out, file.getvalue(), detector.names, detector.size, outputs, author=author, bikeped=facts
+    )
 
 
 def export_any(weights: Path, out: Path, size: int, int8: Path | None = None) -> dict[str, Any]:
@@ -116,7 +80,7 @@ def export_any(weights: Path, out: Path, size: int, int8: Path | None = None) ->
         )
     from bikeped.lab.training.yolo import export_yolo
 
-    return export_yolo(weights, out, size)
+    return export_yolo(weights, out, size).as_dict()
 
 
 def _in_int8(weights: Path, out: Path, data: Path) -> ExportSummary:

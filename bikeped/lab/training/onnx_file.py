@@ -1,33 +1,94 @@
-"""Metadata of an exported ONNX file, and comparison of its output with PyTorch's."""
+"""ONNX files of exported models, with metadata as Ultralytics writes them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from bikeped.errors import DetectorError
+from bikeped.files import write_whole
+from bikeped.lab.training.coco import CocoData
 
 #: ONNX Runtime fuses and reorders operations, so outputs differ by rounding.
 _MOST_BOX_PX, _MOST_SCORE = 0.05, 1e-3
 
 
-def with_metadata(content: bytes, facts: dict[str, str]) -> bytes:
-    """An ONNX file's bytes with `facts` in its metadata, replacing entries of the same names."""
+@dataclass(frozen=True)
+class ExportSummary:
+    """An exported model: class names, input size (width, height), and how much its output differs
+    from PyTorch's."""
+
+    path: Path
+    bytes: int
+    names: tuple[str, ...]
+    size: tuple[int, int]
+    box_difference_px: float
+    score_difference: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "model": str(self.path),
+            "bytes": self.bytes,
+            "names": list(self.names),
+            "size": list(self.size),
+            "largest_box_difference_px": self.box_difference_px,
+            "largest_score_difference": self.score_difference,
+        }
+
+
+def write_onnx(
+    out: Path,
+    content: bytes,
+    names: Sequence[str],
+    size: tuple[int, int],
+    outputs: Iterable[tuple[npt.NDArray[Any], npt.NDArray[Any]]],
+    **facts: str,
+) -> ExportSummary:
+    """Writes an exported model with its metadata, after comparing its outputs with PyTorch's.
+
+    `size`: width and height of the input; `outputs`: pictures [1, 3, h, w] and PyTorch's output for
+    each; `facts` are further metadata. Raises DetectorError where the outputs differ.
+    """
     import onnx
 
     model = onnx.load_model_from_string(content)
-    kept = {entry.key: entry.value for entry in model.metadata_props} | facts
-    onnx.helper.set_model_props(model, kept)
+    known = {"task": "detect", "names": repr(dict(enumerate(names))), "stride": "32"}
+    known |= {"imgsz": repr([size[1], size[0]]), **facts}
+    kept = {entry.key: entry.value for entry in model.metadata_props}
+    onnx.helper.set_model_props(model, kept | known)
     # Path names of the exporter say nothing about the model.
     for node in model.graph.node:
         node.ClearField("doc_string")
-    data: bytes = model.SerializeToString()
-    return data
+    content = model.SerializeToString()
+    apart = [_compare(content, picture, expected, out) for picture, expected in outputs]
+    box_px, score = (max(values) for values in zip(*apart, strict=True))
+    write_whole(out, content)
+    return ExportSummary(out, len(content), tuple(names), size, box_px, score)
 
 
-def compare(
-    content: bytes, picture: np.ndarray[Any, Any], expected: np.ndarray[Any, Any], source: str
+def training_record(data: CocoData, weights: Path, exported: ExportSummary) -> dict[str, Any]:
+    """What training.json records of either network."""
+    return {
+        "data": str(data.source),
+        "data_sha256": data.sha256,
+        "pictures": len(data.images),
+        "objects": data.count,
+        "names": list(exported.names),
+        "size": list(exported.size),
+        "weights": str(weights),
+        "model": str(exported.path),
+        "model_bytes": exported.bytes,
+    }
+
+
+def _compare(
+    content: bytes, picture: npt.NDArray[Any], expected: npt.NDArray[Any], source: Path
 ) -> tuple[float, float]:
     """Largest differences of boxes (pixels) and scores between ONNX Runtime and `expected`.
 

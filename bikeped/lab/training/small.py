@@ -15,6 +15,7 @@ from bikeped.lab.training.device import resolve_device, supports_bfloat16
 from bikeped.lab.training.export import export_network
 from bikeped.lab.training.fit import FitSettings, fit
 from bikeped.lab.training.hard_negative_mining import MiningSettings
+from bikeped.lab.training.onnx_file import training_record
 from bikeped.lab.training.weights import SmallDetector, save_weights
 
 
@@ -57,21 +58,13 @@ def train_small(
     )
     fitted = fit(data, settings, progress, say)
     facts = order.facts | {"data_sha256": data.sha256, "steps": order.steps, "seed": order.seed}
-    weights, model = out / "weights.pt", out / "model.onnx"
+    weights = out / "weights.pt"
     detector = SmallDetector(fitted.network, fitted.names, fitted.size, facts)
     save_weights(detector, weights)
-    exported = export_network(detector, model)
+    exported = export_network(detector, out / "model.onnx")
     return {
         "network": "small",
-        "data": str(data.source),
-        "data_sha256": data.sha256,
-        "pictures": len(data.images),
-        "objects": data.count,
-        "names": list(fitted.names),
-        "size": list(fitted.size),
-        "weights": str(weights),
-        "model": str(model),
-        "model_bytes": exported.bytes,
+        **training_record(data, weights, exported),
         "seconds": round(fitted.seconds, 1),
         "device": device,
         "torch": torch.__version__,

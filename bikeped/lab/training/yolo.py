@@ -23,7 +23,7 @@ import yaml
 from bikeped.errors import DataSetError, DetectorError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.training.coco import CocoData, CocoImage, write_annotations
-from bikeped.lab.training.onnx_file import compare, with_metadata
+from bikeped.lab.training.onnx_file import ExportSummary, training_record, write_onnx
 
 _VALIDATION_SHARE = 20  #: one picture in this many, without a validation set
 _OPSET = 17
@@ -79,15 +79,7 @@ def train_yolo(
     return {
         "network": order.network,
         "library": f"libreyolo {version('libreyolo')}",
-        "data": str(data.source),
-        "data_sha256": data.sha256,
-        "pictures": len(data.images),
-        "objects": data.count,
-        "names": exported["names"],
-        "size": exported["size"],
-        "weights": str(weights),
-        "model": exported["model"],
-        "model_bytes": exported["bytes"],
+        **training_record(data, weights, exported),
         "seconds": round(time.monotonic() - began, 1),
         "device": order.device,
         "torch": version("torch"),
@@ -96,44 +88,18 @@ def train_yolo(
     }
 
 
-def export_yolo(weights: Path, out: Path, size: int) -> dict[str, Any]:
-    """Exports LibreYOLO's weights for a square input and compares the output with PyTorch's.
-
-    Returns a summary for JSON. Raises DetectorError.
-    """
+def export_yolo(weights: Path, out: Path, size: int) -> ExportSummary:
+    """Exports LibreYOLO's weights for a square input. Raises DetectorError."""
     model = _load(weights, None, "cpu")
     names = [str(model.names[i]) for i in range(len(model.names))]
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "model.onnx"
-        model.export(
-            "onnx",
-            output_path=str(draft),
-            imgsz=size,
-            opset=_OPSET,
-            dynamic=False,
-            simplify=False,
-            device="cpu",
-        )
-        content = with_metadata(
-            draft.read_bytes(),
-            {
-                "task": "detect",
-                "names": repr(dict(enumerate(names))),
-                "imgsz": repr([size, size]),
-                "stride": "32",
-            },
-        )
+        fixed = {"opset": _OPSET, "dynamic": False, "simplify": False, "device": "cpu"}
+        model.export("onnx", output_path=str(draft), imgsz=size, **fixed)
+        content = draft.read_bytes()
     picture = np.random.default_rng(0).random((1, 3, size, size), np.float32)
-    box, score = compare(content, picture, _torch_answer(model, picture), str(out))
-    write_whole(out, content)
-    return {
-        "model": str(out),
-        "bytes": len(content),
-        "names": names,
-        "size": [size, size],
-        "largest_box_difference_px": box,
-        "largest_score_difference": score,
-    }
+    outputs = [(picture, _torch_answer(model, picture))]
+    return write_onnx(out, content, names, (size, size), outputs)
 
 
 def write_data(data: CocoData, validation: CocoData | None, folder: Path, seed: int) -> Path:
