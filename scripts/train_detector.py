@@ -1,9 +1,9 @@
-"""Our own small detector from nothing: draws streets, trains, measures, writes the card.
+"""Trains the bundled small detector: draws streets, trains, tests, writes the card.
 
-    scripts/train-detector --out DIR              all of it, an hour and a quarter on two cores
-    scripts/train-detector --out DIR --ship       and puts model and card into the package
+    scripts/train-detector --out DIR              all steps, an hour and a quarter on two cores
+    scripts/train-detector --out DIR --ship       and copies model and card into the package
     scripts/train-detector --out DIR --experiment rectilinear against fisheye-augmented training
-    scripts/train-detector --measure              measures the package's model again, on pictures as
+    scripts/train-detector --measure              tests the package's model again, on pictures as
                                                   they are drawn now, and writes its card
     scripts/train-detector --card                 writes the card's text from its figures
 
@@ -62,13 +62,13 @@ from bikeped.types import Kind
 
 #: The steps take less than an hour on two cores that multiply bfloat16 themselves.
 PICTURES, STEPS = 5000, 11200
-#: Width and height of the whole frame as the shipped network is shown it: what two cores answer 30
-#: times a second. It learns on pictures 1280 across, made a little smaller and larger about this.
+#: Width and height of the shipped network's input for a whole frame: 30 frames a second on two
+#: cores. It trains on pictures 1280 across, scaled around this.
 SHOWN = (1152, 672)
 CROPS = CropSettings(scale=(0.8, 1.02))
 MINING = MiningSettings(after=MINING_ROUNDS)
 TRAINING = DrawnSettings(pictures=PICTURES, seed=1)
-#: As many as that one street, of which come four, does not decide how many false ones there are.
+#: So many that the four pictures of one street do not decide the number of false positives.
 VALIDATION = (
     DrawnTest(pictures=2400, seed=8_000_001),
     DrawnTest(pictures=1200, seed=9_000_001),
@@ -76,14 +76,13 @@ VALIDATION = (
 )
 TEST = DrawnTest(pictures=2400, seed=9_200_001)
 OTHER_LENSES = replace(TEST, pictures=300, seed=9_500_001, own_lens=True)
-#: The shipped confidence of a kind is the lowest with at most this many false ones a 100 frames on
-#: the validation pictures: of pedestrians and cyclists together a little less than the one that is
-#: aimed at, shared so that both are found as often as is aimed at there.
+#: The shipped confidence of a kind is the lowest with at most this many false positives per 100
+#: frames on the validation pictures: of pedestrians and cyclists together a little less than the
+#: target, divided so that both reach the target recall.
 MOST_FALSE = {Kind.PEDESTRIAN: 0.75, Kind.CYCLIST: 0.2, Kind.VEHICLE: 3.0}
 GRID = [round(0.02 * i, 2) for i in range(2, 48)]
 
-#: Of the experiment: both networks get as much of everything. Steps of half the size, so that there
-#: are enough of them to learn something.
+#: Of the experiment, equal for both networks; half the batch, for more steps in the same time.
 EXPERIMENT_PICTURES, EXPERIMENT_STEPS = 500, 2500
 
 
@@ -116,7 +115,7 @@ def main() -> int:
 
 
 def build(out: Path, pictures: int, steps: int) -> None:
-    """Everything up to the card."""
+    """All steps up to the card."""
     loaded = load_config(None)
     data = out / "data"
     if not (data / "annotations.json").is_file():
@@ -135,8 +134,7 @@ def build(out: Path, pictures: int, steps: int) -> None:
         )
     detector = replace(load_weights(training / "weights.pt"), size=SHOWN)
     network, names = detector.network, detector.names
-    # The score that becomes the default configuration's confidence; of the eight-bit network, which
-    # is the one that most will run.
+    # Thresholds are chosen for the eight-bit network, the most used one.
     whole = read_coco(data)
     export_network(detector, out / "plain.onnx")
     quantise(out / "plain.onnx", calibration_images(whole, SHOWN), out / "plain-int8.onnx")
@@ -228,7 +226,7 @@ def write_card(measure: bool) -> None:
 
 
 def shipped_as(loaded: LoadedConfig, model: Path) -> DetectionConfig:
-    """The default configuration, with this model."""
+    """The default detection configuration, with this model."""
     return msgspec.structs.replace(loaded.config.detection, model=str(model.resolve()))
 
 
@@ -245,7 +243,7 @@ def experiment(out: Path) -> None:
         if not (folder / name / "annotations.json").is_file():
             draw_training_set(folder / name, settings, loaded, counted(name, settings.pictures))
     if not (folder / "augmented" / "annotations.json").is_file():
-        # As wide as the held-out pictures, so that objects keep their size.
+        # As wide as the held-out pictures: objects keep their size.
         order = AugmentSettings(WarpRanges(size_px=960), 0, 1, 0.3, 2)
         source = read_coco(folder / "ordinary")
         augment_data(source, folder / "augmented", order, counted("augmented", len(source.images)))
@@ -292,7 +290,7 @@ def say(line: str) -> None:
 
 
 def counted(what: str, total: int) -> Any:
-    """Says how far it is, now and then."""
+    """Prints progress every 20 s."""
     began, last = time.monotonic(), [0.0]
 
     def progress(done: int) -> None:
@@ -309,7 +307,7 @@ def read(path: Path) -> Any:
 
 
 def within(folder: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """`facts` with paths as they are seen from `folder`: the card travels."""
+    """`facts` with paths relative to `folder`."""
     here = f"{folder}/"
     return {k: v.removeprefix(here) if isinstance(v, str) else v for k, v in facts.items()}
 
@@ -319,7 +317,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def commit() -> str:
-    """The sources' commit, with a plus where they were changed."""
+    """The sources' commit, with a plus for uncommitted changes."""
     try:
         run = subprocess.run(
             ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=True

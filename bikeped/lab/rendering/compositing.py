@@ -86,7 +86,7 @@ def contact_shadow(
 def add_glow(
     image: ImageArray, street: Backdrop, lamps: Sequence[Lamp], xy_m: FloatArray | None
 ) -> None:
-    """Halos about lamps; those of a vehicle at `xy_m` only where they look toward the camera."""
+    """Halos about lamps; those of a vehicle at `xy_m` only where they face the camera."""
     eye = street.view.eye_m
     dark = 1.0 if street.conditions.light == "night" else 0.5
     for lamp in lamps:

@@ -16,7 +16,7 @@ WEATHERS = ("dry", "rain")
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a scene looks like apart from its road users.
+    """Appearance of a scene apart from its road users.
 
     `seed`: clothes, paints, noise. `light`: day, overcast, dusk, night, glare. `weather`: dry,
     rain. `place`: road layout, houses, textures and occluders (poles, trees, parked cars); 0 is
@@ -101,7 +101,7 @@ def lighting(conditions: Conditions) -> Lighting:
         top, low, clouds, haze = np.array([10.0, 12, 22]), np.array([38.0, 34, 38]), 0.15, 300.0
         noise *= 1.7
     elif kind == "glare":
-        # In the picture: within 50 degrees of north, where the default camera looks, and low.
+        # In the picture: within 50 degrees of north, the default camera's heading, and low.
         azimuth = math.radians(90 + float(rng.uniform(-50, 50)))
         height = math.radians(float(rng.uniform(9, 24)))
         sun, ambient = np.array([0.85, 0.78, 0.64]), np.array([0.36, 0.37, 0.40])

@@ -25,8 +25,7 @@ class Sprite:
     """`colour` [h, w, 3] uint8, already multiplied by `alpha` [h, w] uint8 (255 is covered), with
     its upper left corner at pixel (`left`, `top`), which may lie outside the picture.
 
-    `full_box_px`: u1, v1, u2, v2 of the whole silhouette; `distance_m`: distance that decides who
-    hides whom.
+    `full_box_px`: u1, v1, u2, v2 of the whole silhouette; `distance_m`: order of occlusion.
     """
 
     left: int

@@ -1,1 +1,1 @@
-"""The detector's own tooling: augmentation, training, export and evaluation. Never on the pole."""
+"""Augments data, and trains, exports and evaluates detectors."""
