@@ -1,1 +1,1 @@
-"""Conformance from pixels: drawn scenarios through the deployed loop, compared with the truth."""
+"""End-to-end simulation: rendered scenarios through the deployed loop; an ablation by stage."""

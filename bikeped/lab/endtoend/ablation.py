@@ -1,7 +1,7 @@
-"""From the scripted run to the pixels, one stage at a time: which stage loses what.
+"""Ablation from scripted positions to the whole loop: which stage loses what.
 
-Each rung hands the deployed tracker and decision a little more of what the pixels do; what changes
-between two rungs is lost (or won) at that stage.
+Each step hands the deployed tracker and decision a little more of what the pixels do; what changes
+between two steps is lost (or gained) at that stage.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ States = npt.NDArray[np.int8]
 
 @dataclass(frozen=True)
 class AblationStep:
-    """One step: its name, what it adds to the one before, and the figures with it."""
+    """One step: its name, what it adds to the one before, its states and metrics."""
 
     name: str
     adds: str
@@ -39,27 +39,24 @@ class AblationStep:
 def run_ablation(
     suite: Suite, runs: Sequence[EndToEndRun], loaded: LoadedConfig, decision: DecisionConfig
 ) -> list[AblationStep]:
-    """The rungs from scripted positions to the deployed loop, over all scenarios of `suite`."""
-    track_and_decide = TrackAndDecide(
+    """The steps from scripted positions to the deployed loop, over all scenarios of `suite`."""
+    tracker = TrackAndDecide(
         loaded, cyclist_box_includes_rider=all(run.cyclist_box_includes_rider for run in runs)
     )
-    seen = suite.perception_results
 
-    def points(present: Callable[[EndToEndRun, int, int], bool]) -> States:
+    def points(in_frame: bool) -> States:
+        pairs = zip(runs, suite.perception_results, strict=True)
         return np.concatenate(
-            [
-                _judge_points(track_and_decide, s, run, present)
-                for s, run in zip(seen, runs, strict=True)
-            ]
+            [states_from_points(tracker, run, seen, in_frame) for run, seen in pairs]
         )
 
-    def boxes(of: Callable[[EndToEndRun, int], Detections]) -> States:
-        return np.concatenate([_judge_boxes(track_and_decide, run, of) for run in runs])
+    def boxes(detections: Callable[[EndToEndRun, int], Detections]) -> States:
+        return np.concatenate([states_from_boxes(tracker, run, detections) for run in runs])
 
     steps: list[tuple[str, str, States]] = [
         ("scripted", "positions with the box model's error", suite.states(decision)),
-        ("tracker", "the pole's tracker in place of the simulation's", points(_always)),
-        ("picture", "who stands outside the picture is not seen", points(_in_picture)),
+        ("tracker", "the pole's tracker in place of the simulation's", points(in_frame=False)),
+        ("picture", "objects outside the picture are not seen", points(in_frame=True)),
         ("outline", "boxes around what was drawn", boxes(_whole)),
         ("occlusion", "hidden parts are not seen", boxes(_visible)),
         ("misses", "only what the detector found", boxes(_found_exact)),
@@ -67,7 +64,7 @@ def run_ablation(
         ("kinds", "the detector's kinds", boxes(_found)),
         (
             "false detections",
-            "all that the detector said: the deployed loop",
+            "all detections: the deployed loop",
             np.concatenate([run.state for run in runs]),
         ),
     ]
@@ -77,54 +74,41 @@ def run_ablation(
     ]
 
 
-def _judge_points(
-    track_and_decide: TrackAndDecide,
-    seen: PerceptionResult,
-    run: EndToEndRun,
-    present: Callable[[EndToEndRun, int, int], bool],
+def states_from_points(
+    tracker: TrackAndDecide, run: EndToEndRun, seen: PerceptionResult, in_frame: bool
 ) -> States:
-    track_and_decide.reset()
+    """States [f] from the simulation's positions; `in_frame`: of agents that were drawn."""
+    tracker.reset()
     states = []
     for frame in range(len(seen.present)):
+        drawn = {o.id for o in run.objects[frame]}
         index = np.asarray(
             [
                 a
                 for a in np.nonzero(seen.present[frame])[0].tolist()
-                if present(run, frame, run.scenario.agents[a].id)
+                if not in_frame or run.scenario.agents[a].id in drawn
             ],
             np.int64,
         )
         points = GroundPoints(seen.kind[index], seen.observed_m[frame, index], index)
-        states.append(int(track_and_decide.update_from_points(points, frame / FPS).decision.state))
+        states.append(int(tracker.update_from_points(points, frame / FPS).decision.state))
     return np.asarray(states, np.int8)
 
 
-def _judge_boxes(
-    track_and_decide: TrackAndDecide, run: EndToEndRun, of: Callable[[EndToEndRun, int], Detections]
+def states_from_boxes(
+    tracker: TrackAndDecide, run: EndToEndRun, detections: Callable[[EndToEndRun, int], Detections]
 ) -> States:
-    track_and_decide.reset()
-    return np.asarray(
-        [
-            int(
-                track_and_decide.update(
-                    of(run, f), run.width, run.height, f / FPS, 0.0
-                ).decision.state
-            )
-            for f in range(len(run.state))
-        ],
-        np.int8,
+    """States [f] from `detections(run, frame)`."""
+    tracker.reset()
+    results = (
+        tracker.update(detections(run, frame), run.width, run.height, frame / FPS, 0.0)
+        for frame in range(len(run.state))
     )
-
-
-def _always(run: EndToEndRun, frame: int, agent: int) -> bool:
-    return True
-
-
-def _in_picture(run: EndToEndRun, frame: int, agent: int) -> bool:
-    return any(o.id == agent for o in run.objects[frame])
+    return np.asarray([int(result.decision.state) for result in results], np.int8)
 
 
 def _exact(objects: Sequence[DrawnObject], whole: bool) -> Detections:
+    """Detections with the boxes that were drawn; `whole`: as if nothing were hidden."""
     if not objects:
         return Detections.empty()
     return Detections(

@@ -1,4 +1,4 @@
-"""A drawn scenario as a source of frames: JPEG, as the camera on the pole gives them."""
+"""A rendered scenario as a frame source: JPEG, like the camera on the pole."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from bikeped.capture.base import FrameSource
 from bikeped.lab.rendering import DrawnObject, ScenePainter
 from bikeped.types import Frame
 
-#: Of the pole's camera, roughly: what its compression does to small figures belongs to the chain.
+#: Roughly that of the pole's camera: its compression affects small figures.
 JPEG_QUALITY = 90
 
 
 class DrawnSource(FrameSource):
-    """Draws a frame when it is asked for; `objects` keeps what was in each, in order."""
+    """Renders a frame at each read; `objects` holds the drawn objects of each, in order."""
 
     def __init__(self, painter: ScenePainter, name: str, time_s: Sequence[float], fps: float):
         self._painter = painter
@@ -39,4 +39,4 @@ class DrawnSource(FrameSource):
         return Frame(number, t, self.width, self.height, jpeg=jpeg)
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to release."""

@@ -1,4 +1,4 @@
-"""The figure of pixel conformance: stages, recall and localisation error."""
+"""The figure of the end-to-end simulation: stages, recall and localisation error."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bikeped.lab.plotting import GREY, SERIES, FigureSheet, to_floats, to_percents
+from bikeped.lab.plotting import GREY, SERIES, FigureSheet, plot_series, to_floats, to_percents
 from bikeped.types import Kind
 
 
@@ -28,41 +28,21 @@ def draw_pixels(data: Mapping[str, Any], folder: Path) -> list[Path]:
         rows = data["stages"]
         names = [row["name"] for row in rows]
         at = range(len(rows))
-        for key, (colour, marker, dash) in zip(
-            ("sensitivity", "specificity"), SERIES, strict=False
-        ):
-            values = to_percents(row[key] for row in rows)
-            stages.plot(at, values, color=colour, marker=marker, linestyle=dash, label=key)
+        for key, style in zip(("sensitivity", "specificity"), SERIES, strict=False):
+            plot_series(stages, at, to_percents(row[key] for row in rows), style, label=key)
         stages.set_xticks(list(at), names, rotation=35, ha="right")
         stages.set(ylabel="%", title="Sensitivity and specificity")
         stages.legend(loc="lower left")
-        for kind, (colour, marker, dash) in zip(Kind, SERIES, strict=False):
-            cells = [
-                r for r in data["detection"]["by_distance"] if r["kind"] == kind.label and r["seen"]
-            ]
-            recall.plot(
-                _middles(cells),
-                to_percents(r["recall"] for r in cells),
-                color=colour,
-                marker=marker,
-                linestyle=dash,
-                label=kind.label,
-            )
+        for kind, style in zip(Kind, SERIES, strict=False):
+            of_kind = [r for r in data["detection"]["by_distance"] if r["kind"] == kind.label]
+            cells = [r for r in of_kind if r["seen"]]
+            values = to_percents(r["recall"] for r in cells)
+            plot_series(recall, _middles(cells), values, style, label=kind.label)
             cells = [r for r in data["localisation"] if r["kind"] == kind.label and r["found"]]
-            places.plot(
-                _middles(cells),
-                to_floats(r["mean_m"] for r in cells),
-                color=colour,
-                marker=marker,
-                linestyle=dash,
-                label=kind.label,
-            )
-            places.plot(
-                _middles(cells),
-                to_floats(r["box_model_mean_m"] for r in cells),
-                color=colour,
-                linewidth=0.7,
-            )
+            values = to_floats(r["mean_m"] for r in cells)
+            plot_series(places, _middles(cells), values, style, label=kind.label)
+            model = to_floats(r["box_model_mean_m"] for r in cells)
+            places.plot(_middles(cells), model, color=style[0], linewidth=0.7)
         recall.axhline(95, color=GREY, linewidth=0.7)
         recall.set(xlabel="distance, m", ylabel="%", ylim=(0, 102), title="Recall")
         recall.legend(loc="lower left")

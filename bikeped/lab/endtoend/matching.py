@@ -1,4 +1,4 @@
-"""Which detection is which drawn object."""
+"""Matching of detections to drawn objects."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from bikeped.geometry.boxes import Boxes, iou_matrix
 from bikeped.lab.rendering import DrawnObject
 from bikeped.types import Detections, IntArray
 
-#: Least overlap (intersection over union) of a detection with the object that it is.
-#: Below COCO's 0.5: a walker 20 m away is four pixels wide, and half a pixel is a fifth of that.
+#: Least overlap (intersection over union) of a detection with its object.
+#: Below COCO's 0.5: a pedestrian at 20 m is four pixels wide; half a pixel costs a fifth of IoU.
 MIN_IOU = 0.3
-#: An object of which less than this is to be seen is not counted as missed.
+#: Objects with a smaller visible share are not counted as missed.
 MIN_VISIBLE = 0.25
 
 

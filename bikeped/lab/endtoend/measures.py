@@ -1,8 +1,8 @@
-"""How well the detector finds what was drawn, and how well its boxes lie on the ground."""
+"""Recall of the detector and localisation error of its boxes, by kind and distance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,7 +13,7 @@ from bikeped.lab.endtoend.matching import MIN_VISIBLE, match_detections
 from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.simulation.perception import PerceptionResult
 from bikeped.pipeline.ground_mapper import GroundMapper
-from bikeped.types import Detections, FloatArray, Kind
+from bikeped.types import BoolArray, Detections, FloatArray, Kind
 
 #: Bounds of the distance rings, metres from the camera.
 RINGS_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0)
@@ -21,15 +21,15 @@ RINGS_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0)
 
 @dataclass(frozen=True)
 class Observations:
-    """Every drawn object of every frame that could be seen: arrays [n].
+    """Every visible drawn object of every frame: arrays [n].
 
-    `found_m` is how far from its true place the detector's box puts it on the ground, `exact_m` its
-    exact box, `model_m` the simulation's box model; NaN where there is none. `found` says whether
-    it was found, `kind_right` whether as what it is.
+    Localisation errors (m): `found_m` of the detector's box, `exact_m` of the drawn box, `model_m`
+    of the simulation's box model; NaN where there is none. `found`: detected; `kind_right`:
+    detected with the right kind.
     """
 
     frames: int
-    false: dict[Kind, int]  #: detections that are nobody, by what they were taken for
+    false: dict[Kind, int]  #: false detections, by their kind
     kind: FloatArray
     distance_m: FloatArray
     found: FloatArray
@@ -42,7 +42,7 @@ class Observations:
 def collect_observations(
     runs: Sequence[EndToEndRun], seen: Sequence[PerceptionResult], loaded: LoadedConfig
 ) -> Observations:
-    """What there was to see in `runs`, and what became of it."""
+    """The visible objects of all `runs`, and how each was detected; `seen`: by scenario."""
     ground_mapper = GroundMapper(loaded)
     rows: list[tuple[float, ...]] = []
     false = dict.fromkeys(Kind, 0)
@@ -57,18 +57,18 @@ def collect_observations(
             matched = match_detections(detections, objects)
             for kind in detections.kind[matched.object < 0].tolist():
                 false[Kind(kind)] += 1
-            found_xy = _on_ground(
-                ground_mapper, framing.frame_to_crop(detections.bottom_centre_px())
-            )
-            boxes = Detections(
+            exact = Detections(
                 np.zeros(len(objects), np.int8),
                 np.ones(len(objects), np.float32),
                 np.asarray([o.box_px for o in objects], np.float32).reshape(-1, 4),
             )
-            exact_xy = _on_ground(ground_mapper, framing.frame_to_crop(boxes.bottom_centre_px()))
+            found_xy, exact_xy = (
+                _ground_points(ground_mapper, framing.frame_to_crop(boxes.bottom_centre_px()))
+                for boxes in (detections, exact)
+            )
             for index, item in enumerate(objects):
                 if item.visible < MIN_VISIBLE or item.id not in column:
-                    continue  # hidden; or a parked car, which no scenario knows
+                    continue  # hidden, or a parked car of the drawn street
                 d = int(matched.found[index])
                 rows.append(
                     (
@@ -85,49 +85,44 @@ def collect_observations(
     return Observations(frames, false, *table.T)
 
 
-def _on_ground(ground_mapper: GroundMapper, crop_px: FloatArray) -> FloatArray:
-    """[n, 2] places of bottom centres; NaN where they lie on no ground."""
+def _ground_points(ground_mapper: GroundMapper, crop_px: FloatArray) -> FloatArray:
+    """Ground points [n, 2] of bottom centres; NaN above the horizon."""
     xy, valid = ground_mapper.table.lookup(crop_px)
     return np.asarray(np.where(valid[:, None], xy, np.nan))
 
 
-def recall_rows(all_sights: Observations) -> list[dict[str, float | str | int | None]]:
+Row = dict[str, float | str | int | None]
+
+
+def recall_rows(observations: Observations) -> list[Row]:
     """Recall by kind and distance ring: `seen` object frames, the share `found` and `recall`
-    (found as what it is)."""
-    rows: list[dict[str, float | str | int | None]] = []
-    for kind, low, high, there in _cells(all_sights):
-        count = int(there.sum())
-        rows.append(
-            {
-                "kind": kind.label,
-                "from_m": low,
-                "to_m": high,
-                "seen": count,
-                "found": float(all_sights.found[there].mean()) if count else None,
-                "recall": float(all_sights.kind_right[there].mean()) if count else None,
-            }
-        )
-    return rows
+    (found with the right kind)."""
+    return [
+        {
+            **ring,
+            "seen": int(inside.sum()),
+            "found": _mean(observations.found[inside]),
+            "recall": _mean(observations.kind_right[inside]),
+        }
+        for ring, inside in _rings(observations)
+    ]
 
 
-def localisation_rows(all_sights: Observations) -> list[dict[str, float | str | int | None]]:
+def localisation_rows(observations: Observations) -> list[Row]:
     """Localisation error by kind and ring: mean and 90th percentile of the found boxes, and beside
     them, over the same objects, the exact boxes' and the simulation's box model's means, metres."""
-    rows: list[dict[str, float | str | int | None]] = []
-    for kind, low, high, there in _cells(all_sights):
-        there = there & np.isfinite(all_sights.found_m)
-        count = int(there.sum())
-        found = all_sights.found_m[there]
+    rows: list[Row] = []
+    for ring, inside in _rings(observations):
+        at = inside & np.isfinite(observations.found_m)
+        error_m = observations.found_m[at]
         rows.append(
             {
-                "kind": kind.label,
-                "from_m": low,
-                "to_m": high,
-                "found": count,
-                "mean_m": float(found.mean()) if count else None,
-                "p90_m": float(np.percentile(found, 90)) if count else None,
-                "exact_box_mean_m": _mean(all_sights.exact_m[there]),
-                "box_model_mean_m": _mean(all_sights.model_m[there]),
+                **ring,
+                "found": len(error_m),
+                "mean_m": _mean(error_m),
+                "p90_m": float(np.percentile(error_m, 90)) if len(error_m) else None,
+                "exact_box_mean_m": _mean(observations.exact_m[at]),
+                "box_model_mean_m": _mean(observations.model_m[at]),
             }
         )
     return rows
@@ -138,16 +133,10 @@ def _mean(values: FloatArray) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def _cells(all_sights: Observations) -> list[tuple[Kind, float, float, np.ndarray]]:  # type: ignore[type-arg]
-    return [
-        (
-            kind,
-            low,
-            high,
-            (all_sights.kind == kind)
-            & (all_sights.distance_m >= low)
-            & (all_sights.distance_m < high),
-        )
-        for kind in Kind
-        for low, high in pairwise(RINGS_M)
-    ]
+def _rings(observations: Observations) -> Iterator[tuple[Row, BoolArray]]:
+    """By kind and distance ring: its keys, and which observations lie in it [n]."""
+    distance_m = observations.distance_m
+    for kind in Kind:
+        for low, high in pairwise(RINGS_M):
+            inside = (observations.kind == kind) & (distance_m >= low) & (distance_m < high)
+            yield {"kind": kind.label, "from_m": low, "to_m": high}, np.asarray(inside)

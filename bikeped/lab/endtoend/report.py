@@ -1,10 +1,11 @@
-"""Pixel conformance as data, tables and a figure."""
+"""Results of the end-to-end simulation as data and tables."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 from bikeped.lab.endtoend.ablation import AblationStep
@@ -24,7 +25,7 @@ GOAL = 0.03
 
 @dataclass(frozen=True)
 class DrawingSettings:
-    """How the scenarios were drawn, for the record."""
+    """How the scenarios were rendered, for the record."""
 
     width: int
     height: int
@@ -37,14 +38,14 @@ class DrawingSettings:
 def end_to_end_result(
     suite: Suite,
     runs: Sequence[EndToEndRun],
-    rungs: Sequence[AblationStep],
+    steps: Sequence[AblationStep],
     seen: Observations,
     drawing: DrawingSettings,
 ) -> ExperimentResult:
-    """All figures: `data` for JSON, and the tables that people read."""
-    scripted, whole = rungs[0].metrics, rungs[-1].metrics
+    """All results: `data` for JSON, and the tables for people."""
+    scripted, whole = steps[0].metrics, steps[-1].metrics
     data: dict[str, Any] = {
-        "drawing": {name: getattr(drawing, name) for name in DrawingSettings.__dataclass_fields__},
+        "drawing": asdict(drawing),
         "detector": runs[0].detector,
         "model_hash": runs[0].model_hash,
         "frames": seen.frames,
@@ -52,9 +53,9 @@ def end_to_end_result(
             "within": GOAL,
             "sensitivity_change": finite_or_none(whole.sensitivity - scripted.sensitivity),
             "specificity_change": finite_or_none(whole.specificity - scripted.specificity),
-            "holds": within_goal(rungs),
+            "holds": within_goal(steps),
         },
-        "stages": [_stage(rungs, i) for i in range(len(rungs))],
+        "stages": [_stage(steps, i) for i in range(len(steps))],
         "by_scenario": {
             name: {"scripted": scripted.scenario_dict(i), "pixels": whole.scenario_dict(i)}
             for i, name in enumerate(suite.names)
@@ -73,45 +74,43 @@ def end_to_end_result(
     return ExperimentResult("pixels", data, _tables(data))
 
 
-def within_goal(rungs: Sequence[AblationStep]) -> bool:
+def within_goal(steps: Sequence[AblationStep]) -> bool:
     """Whether sensitivity and specificity from pixels are within the goal of the scripted run's."""
-    first, last = rungs[0].metrics, rungs[-1].metrics
+    first, last = steps[0].metrics, steps[-1].metrics
     pairs = ((first.sensitivity, last.sensitivity), (first.specificity, last.specificity))
     # Without actionable frames (or without safe ones) there is nothing to compare.
     return all(math.isnan(a) or abs(a - b) <= GOAL for a, b in pairs)
 
 
-def verdict(rungs: Sequence[AblationStep]) -> str:
-    """In one or two sentences: how far from the scripted run, and where most of it is lost."""
+def verdict(steps: Sequence[AblationStep]) -> str:
+    """One or two sentences: the difference to the scripted run, and where most of it is lost."""
     parts = []
-    for name, label in (("sensitivity", "sensitivity"), ("specificity", "specificity")):
-        values = [float(getattr(r.metrics, name)) for r in rungs]
+    for name in ("sensitivity", "specificity"):
+        values = [float(getattr(step.metrics, name)) for step in steps]
         if math.isnan(values[0]):
-            parts.append(f"no frame counts for {label}")
+            parts.append(f"no frame counts for {name}")
             continue
-        change = values[-1] - values[0]
-        text = f"{label} {100 * change:+.1f} points against the scripted run"
-        steps = [
-            (b - a, r.name) for a, b, r in zip(values[:-1], values[1:], rungs[1:], strict=True)
-        ]
-        worst = min(steps)
-        if worst[0] < -0.001:
-            text += f" (most is lost at {worst[1]}: {100 * worst[0]:+.1f})"
+        text = f"{name} {100 * (values[-1] - values[0]):+.1f} points against the scripted run"
+        changes = [after - before for before, after in pairwise(values)]
+        worst, stage = min(zip(changes, (step.name for step in steps[1:]), strict=True))
+        if worst < -0.001:
+            text += f" (most is lost at {stage}: {100 * worst:+.1f})"
         parts.append(text)
-    held = "within" if within_goal(rungs) else "not within"
+    held = "within" if within_goal(steps) else "not within"
     return f"{'; '.join(parts)}: {held} {100 * GOAL:.0f} points."
 
 
-def _stage(rungs: Sequence[AblationStep], index: int) -> dict[str, Any]:
-    rung = rungs[index]
-    now = rung.metrics.as_dict()
-    change: dict[str, float | None] = {}
-    if index:
-        before = rungs[index - 1].metrics.as_dict()
-        for key in ("sensitivity", "specificity", "mean_warning_budget_s", "sev_fn", "fatigue"):
-            a, b = before[key], now[key]
-            change[key] = None if a is None or b is None else b - a
-    return {"name": rung.name, "adds": rung.adds, **now, "change": change}
+def _stage(steps: Sequence[AblationStep], index: int) -> dict[str, Any]:
+    """One step's metrics, and their change against the step before."""
+    now = steps[index].metrics.as_dict()
+    before = steps[index - 1].metrics.as_dict() if index else {}
+    keys = ("sensitivity", "specificity", "mean_warning_budget_s", "sev_fn", "fatigue")
+    change = {
+        key: None if before[key] is None or now[key] is None else now[key] - before[key]
+        for key in keys
+        if before
+    }
+    return {"name": steps[index].name, "adds": steps[index].adds, **now, "change": change}
 
 
 def _tables(data: dict[str, Any]) -> tuple[ResultTable, ...]:

@@ -1,9 +1,9 @@
-"""Scenarios drawn and sent through the deployed loop, each in a process of its own."""
+"""Scenarios rendered and run through the deployed loop, each in a process of its own."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from bikeped.config import LoadedConfig
 from bikeped.feedback import SignalLogic
 from bikeped.lab.endtoend.drawn_source import DrawnSource
-from bikeped.lab.process_pool import worker_pool
+from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
@@ -28,7 +28,7 @@ from bikeped.types import Detections
 
 @dataclass(frozen=True)
 class EndToEndRun:
-    """One scenario from pixels: what was drawn, found and decided in each frame."""
+    """One scenario end to end: what was drawn, detected and decided in each frame."""
 
     scenario: Scenario
     objects: tuple[tuple[DrawnObject, ...], ...]
@@ -41,8 +41,8 @@ class EndToEndRun:
     cyclist_box_includes_rider: bool  #: as the detector has it
 
 
-class _Kept:
-    """An output of the loop that keeps what was found and decided."""
+class _Recorder:
+    """An output of the loop that keeps detections and states."""
 
     def __init__(self) -> None:
         self.detections: list[Detections] = []
@@ -61,35 +61,35 @@ def run_scenario(
     detector: FrameDetector | None = None,
 ) -> EndToEndRun:
     """Draws `scenario` and runs it through the loop; `detector` replaces the configured model."""
-    looking = detector if detector is not None else load_detector_pool(loaded)
+    detector = detector if detector is not None else load_detector_pool(loaded)
     painter = ScenePainter(scenario, scene_camera(loaded, size), conditions)
     source = DrawnSource(painter, scenario.name, scenario.frame_times(FPS).tolist(), FPS)
-    kept = _Kept()
+    recorder = _Recorder()
     track_and_decide = TrackAndDecide(
-        loaded, cyclist_box_includes_rider=looking.cyclist_box_includes_rider
+        loaded, cyclist_box_includes_rider=detector.cyclist_box_includes_rider
     )
 
-    async def through() -> None:
+    async def run_loop() -> None:
         loop = Loop(
             feed=RecordedFeed(source),
-            detection=DetectionStage(looking),
+            detection=DetectionStage(detector),
             track_and_decide=track_and_decide,
             dispatcher=SignalDispatcher(SignalLogic.from_config(loaded.config.feedback)),
-            outputs=[kept],
+            outputs=[recorder],
         )
         await loop.run()
 
-    asyncio.run(through())
+    asyncio.run(run_loop())
     return EndToEndRun(
         scenario=scenario,
         objects=tuple(source.objects),
-        detections=tuple(kept.detections),
-        state=np.asarray(kept.state, np.int8),
+        detections=tuple(recorder.detections),
+        state=np.asarray(recorder.state, np.int8),
         width=size[0],
         height=size[1],
-        detector=looking.name,
-        model_hash=looking.model_hash,
-        cyclist_box_includes_rider=looking.cyclist_box_includes_rider,
+        detector=detector.name,
+        model_hash=detector.model_hash,
+        cyclist_box_includes_rider=detector.cyclist_box_includes_rider,
     )
 
 
@@ -99,20 +99,10 @@ def run_all(
     conditions: Conditions,
     size: tuple[int, int],
     processes: int = 1,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: ProgressCallback = no_progress,
 ) -> list[EndToEndRun]:
-    """Every scenario, longest first over `processes`, in the given order."""
-    if processes == 1:
-        runs = []
-        for scenario in scenarios:
-            runs.append(run_scenario(loaded, scenario, conditions, size))
-            progress(len(runs))
-        return runs
-    found: dict[int, EndToEndRun] = {}
-    with worker_pool(processes) as pool:
-        order = sorted(range(len(scenarios)), key=lambda i: -scenarios[i].duration_s)
-        jobs = {i: pool.submit(run_scenario, loaded, scenarios[i], conditions, size) for i in order}
-        for index in order:
-            found[index] = jobs[index].result()
-            progress(len(found))
-    return [found[i] for i in range(len(scenarios))]
+    """A run of every scenario, in their order; the longest start first."""
+    order = sorted(range(len(scenarios)), key=lambda i: -scenarios[i].duration_s)
+    jobs = [(loaded, scenarios[i], conditions, size) for i in order]
+    runs = run_jobs(run_scenario, jobs, processes, progress)
+    return [run for _, run in sorted(zip(order, runs, strict=True), key=lambda pair: pair[0])]

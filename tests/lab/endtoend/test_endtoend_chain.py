@@ -9,7 +9,7 @@ import pytest
 from drawn_detectors import OracleDetector
 
 from bikeped.config import LoadedConfig, load_config
-from bikeped.lab.endtoend.ablation import run_ablation
+from bikeped.lab.endtoend.ablation import run_ablation, states_from_boxes
 from bikeped.lab.endtoend.matching import MIN_VISIBLE
 from bikeped.lab.endtoend.measures import collect_observations, localisation_rows, recall_rows
 from bikeped.lab.endtoend.report import DrawingSettings, end_to_end_result, verdict
@@ -59,31 +59,30 @@ def test_every_frame_is_decided_once(run: EndToEndRun, scenario: Scenario) -> No
     assert len(run.state) == len(run.objects) == len(run.detections) == frames
 
 
-def test_a_perfect_eye_loses_nothing_between_occlusion_and_its_boxes(
+def test_a_perfect_detector_loses_nothing_between_occlusion_and_its_boxes(
     run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
     suite = Suite.load([scenario], loaded)
-    rungs = {r.name: r for r in run_ablation(suite, [run], loaded, loaded.config.decision)}
+    steps = {r.name: r for r in run_ablation(suite, [run], loaded, loaded.config.decision)}
     for name in ("misses", "boxes", "kinds"):
-        np.testing.assert_array_equal(rungs[name].states, rungs["occlusion"].states)
+        np.testing.assert_array_equal(steps[name].states, steps["occlusion"].states)
     # The bush is a pedestrian for ever: nobody is IDLE with it.
-    assert not (rungs["false detections"].states[5:] == 0).any()
-    assert rungs["false detections"].metrics.sensitivity == pytest.approx(
-        rungs["scripted"].metrics.sensitivity, abs=0.35
+    assert not (steps["false detections"].states[5:] == 0).any()
+    assert steps["false detections"].metrics.sensitivity == pytest.approx(
+        steps["scripted"].metrics.sensitivity, abs=0.35
     )
 
 
-def test_the_loop_and_the_ladder_decide_alike(
+def test_the_loop_and_the_ablation_decide_alike(
     run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
     """The last step comes out of the loop, the others out of its tracker: same boxes and states."""
-    from bikeped.lab.endtoend.ablation import _judge_boxes
     from bikeped.pipeline.track_and_decide import TrackAndDecide
 
     track_and_decide = TrackAndDecide(
         loaded, cyclist_box_includes_rider=run.cyclist_box_includes_rider
     )
-    again = _judge_boxes(track_and_decide, run, lambda r, f: r.detections[f])
+    again = states_from_boxes(track_and_decide, run, lambda r, f: r.detections[f])
     np.testing.assert_array_equal(again, run.state)
 
 
@@ -113,14 +112,14 @@ def test_an_eye_that_sees_nothing_is_named(
         state=np.zeros_like(run.state),
     )
     suite = Suite.load([scenario], loaded)
-    rungs = run_ablation(suite, [blind], loaded, loaded.config.decision)
-    assert rungs[-1].metrics.sensitivity == 0.0
-    text = verdict(rungs)
+    steps = run_ablation(suite, [blind], loaded, loaded.config.decision)
+    assert steps[-1].metrics.sensitivity == 0.0
+    text = verdict(steps)
     assert "misses" in text
     assert "not within 3 points" in text
     seen = collect_observations([blind], suite.perception_results, loaded)
     result = end_to_end_result(
-        suite, [blind], rungs, seen, DrawingSettings(*SIZE, "day", "dry", 0, 0)
+        suite, [blind], steps, seen, DrawingSettings(*SIZE, "day", "dry", 0, 0)
     )
     assert result.data["goal"]["holds"] is False
     assert result.data["stages"][0]["name"] == "scripted"
