@@ -43,7 +43,7 @@ class GeometryError(BikepedError):
 
 
 class CaptureError(BikepedError):
-    """A camera, a video or a picture cannot be opened or read."""
+    """A camera, a video or an image cannot be opened or read."""
 
 
 class DetectorError(BikepedError):

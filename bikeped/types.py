@@ -2,7 +2,7 @@
 
 Times are seconds on the machine's monotonic clock (`*_s`), pixels are sensor pixels unless a name
 says otherwise, positions are metres in the camera ground frame (x forward, y right, origin on the
-ground below the lens). Arrays run in parallel; `check` functions state expected and actual shape.
+ground below the lens). Arrays are parallel; constructors raise ValueError for a wrong shape.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ImageArray = npt.NDArray[np.uint8]
 
 
 class Kind(enum.IntEnum):
-    """What an object is to the decision; the code is what kind arrays hold."""
+    """Kind of road user; its value is the code in `kind` arrays."""
 
     PEDESTRIAN = 0
     CYCLIST = 1
@@ -48,14 +48,14 @@ class State(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture as the camera gave it, undecoded where the camera encodes.
+    """One camera image, undecoded where the camera encodes it.
 
     Exactly one of `jpeg` (a whole JPEG file) and `rgb` (height x width x 3, uint8) is set.
     """
 
     number: int  #: counts every frame that the source delivered, dropped ones included
     captured_s: float  #: capture time; monotonic for a live camera, media time for a recording
-    width: int  #: of the full picture, in pixels
+    width: int  #: of the full frame, in pixels
     height: int
     jpeg: bytes | memoryview | None = None
     rgb: ImageArray | None = None
@@ -67,7 +67,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Region:
-    """The part of a frame that is looked at, as shares of its width and height from the top left.
+    """The part of a frame that the detector sees, as shares of its width and height.
 
     `aspect` is the whole frame's width over its height. Scaled copies of a frame have the same
     region. Raises ValueError for one without area.
@@ -82,7 +82,7 @@ class Region:
     def __post_init__(self) -> None:
         across = 0 <= self.left < self.right <= 1
         if not (across and 0 <= self.top < self.bottom <= 1 and self.aspect > 0):
-            raise ValueError(f"no part of a frame: {self}")
+            raise ValueError(f"not a part of a frame: {self}")
 
     def pixels(self, width_px: int, height_px: int) -> tuple[int, int, int, int]:
         """First column and row, and those after the last, in a copy of the frame of this size."""
@@ -98,7 +98,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Detections:
-    """What the detector found in one frame, most confident first.
+    """Detections in one frame, most confident first.
 
     `kind` [n] int8 codes of `Kind`; `confidence` [n] in 0..1; `box_px` [n, 4] as u1, v1, u2, v2
     in pixels of the full frame.
@@ -110,9 +110,7 @@ class Detections:
 
     def __post_init__(self) -> None:
         n = len(self.kind)
-        _expect("Detections.kind", self.kind, (n,))
-        _expect("Detections.confidence", self.confidence, (n,))
-        _expect("Detections.box_px", self.box_px, (n, 4))
+        _check_shapes(self, kind=(n,), confidence=(n,), box_px=(n, 4))
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -128,7 +126,7 @@ class Detections:
         return Detections(self.kind[index], self.confidence[index], self.box_px[index])
 
     def bottom_centre_px(self) -> FloatArray:
-        """[n, 2] u, v of the middle of each lower edge: the point that is put on the ground."""
+        """[n, 2] u, v of the middle of each lower edge, which is projected onto the ground."""
         box = self.box_px.astype(np.float64)
         return np.stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]], axis=1)
 
@@ -143,8 +141,7 @@ class GroundPoints:
 
     def __post_init__(self) -> None:
         n = len(self.kind)
-        _expect("GroundPoints.xy_m", self.xy_m, (n, 2))
-        _expect("GroundPoints.detection", self.detection, (n,))
+        _check_shapes(self, xy_m=(n, 2), detection=(n,))
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -152,7 +149,7 @@ class GroundPoints:
 
 @dataclass(frozen=True)
 class Tracks:
-    """The objects believed present at `time_s`, oldest first (ascending id).
+    """The road users tracked at `time_s`, oldest first (ascending id).
 
     `id` [n]; `kind` [n]; `xy_m` [n, 2]; `velocity_mps` [n, 2]; `unseen_s` [n], 0 when matched in
     this frame; `detection` [n], index of the matched detection in this frame or -1.
@@ -168,11 +165,9 @@ class Tracks:
 
     def __post_init__(self) -> None:
         n = len(self.id)
-        _expect("Tracks.kind", self.kind, (n,))
-        _expect("Tracks.xy_m", self.xy_m, (n, 2))
-        _expect("Tracks.velocity_mps", self.velocity_mps, (n, 2))
-        _expect("Tracks.unseen_s", self.unseen_s, (n,))
-        _expect("Tracks.detection", self.detection, (n,))
+        _check_shapes(
+            self, kind=(n,), xy_m=(n, 2), velocity_mps=(n, 2), unseen_s=(n,), detection=(n,)
+        )
 
     def __len__(self) -> int:
         return len(self.id)
@@ -198,7 +193,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class PairMetrics:
-    """The figures that one cyclist-pedestrian pair was judged by."""
+    """The measurements of one cyclist-pedestrian pair that the rule compares."""
 
     cyclist_id: int
     pedestrian_id: int
@@ -208,17 +203,17 @@ class PairMetrics:
     displacement_m: float  #: of the cyclist over the lookback
     speed_mps: float  #: of the cyclist
     d_min_m: float
-    d_max_m: float  #: raised to the stopping distance where the configuration says so
+    d_max_m: float  #: at least the stopping distance where `decision.speed_adaptive` is on
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the light must say at `time_s`, why, and in one line for a resident."""
+    """The state at `time_s`, with the reason in one line for a resident."""
 
     time_s: float
     state: State
     sentence: str
-    pair: PairMetrics | None = None  #: the pair that fired (ALERT) or the nearest one (WARNING)
+    pair: PairMetrics | None = None  #: the first that fires (ALERT) or the nearest (WARNING)
 
 
 class Colour(str, enum.Enum):
@@ -241,7 +236,7 @@ class Sound(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Signal:
-    """What the road user sees and hears."""
+    """The light and sound that road users perceive."""
 
     name: str  #: IDLE, SAFE, WARNING, ALERT, FAULT or OFF
     colour: Colour
@@ -250,6 +245,8 @@ class Signal:
     faults: tuple[Fault, ...] = ()  #: what is wrong now; not empty when the signal is FAULT
 
 
-def _expect(name: str, array: npt.NDArray[Any], shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+def _check_shapes(owner: object, **shapes: tuple[int, ...]) -> None:
+    for name, shape in shapes.items():
+        actual = getattr(owner, name).shape
+        if actual != shape:
+            raise ValueError(f"{type(owner).__name__}.{name}: expected shape {shape}, got {actual}")

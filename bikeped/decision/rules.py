@@ -164,18 +164,7 @@ def _positions_before(
     both tracks reach, and the time [m] between, seconds."""
     now = rows.time_s[cyclist]
     target = now - (lookback_s - EPSILON_S)
-    c_old, p_old = cyclist, pedestrian
-    c_new, p_new = cyclist, pedestrian
-    while True:
-        late = rows.time_s[c_old] > target
-        if not np.count_nonzero(late):
-            break
-        c_prev, p_prev = rows.previous[c_old], rows.previous[p_old]
-        go = late & (c_prev >= 0) & (p_prev >= 0)
-        if not np.count_nonzero(go):
-            break
-        c_new, p_new = np.where(go, c_old, c_new), np.where(go, p_old, p_new)
-        c_old, p_old = np.where(go, c_prev, c_old), np.where(go, p_prev, p_old)
+    (c_old, p_old), (c_new, p_new) = _walk_back(rows, target, cyclist, pedestrian)
     c_past, p_past = rows.xy_m[c_old], rows.xy_m[p_old]
     old_s = rows.time_s[c_old]
     overshoot = now - lookback_s - old_s
@@ -192,17 +181,24 @@ def _positions_before(
 def _speed(rows: TrackRows, row: IndexArray, window_s: float) -> FloatArray:
     """Speeds [n] (m/s) over the last `window_s`, or over the track's life where it is shorter."""
     now = rows.time_s[row]
-    target = now - (window_s - EPSILON_S)
-    old = row
-    while True:
-        late = rows.time_s[old] > target
-        if not np.count_nonzero(late):
-            break
-        previous = rows.previous[old]
-        go = late & (previous >= 0)
-        if not np.count_nonzero(go):
-            break
-        old = np.where(go, previous, old)
+    old = _walk_back(rows, now - (window_s - EPSILON_S), row)[0][0]
     elapsed = now - rows.time_s[old]
     displacement = _length(rows.xy_m[row] - rows.xy_m[old])
     return np.where(elapsed > 0, displacement / np.maximum(elapsed, EPSILON_S), 0.0)
+
+
+def _walk_back(
+    rows: TrackRows, target_s: FloatArray, *tracks: IndexArray
+) -> tuple[IndexArray, IndexArray]:
+    """Follows `previous` from the rows `tracks` [k, n], k at once, to `target_s` [n] or earlier, or
+    as far as all k reach: the rows [k, n] arrived at, and those visited just before."""
+    old = new = np.stack(tracks)
+    while True:
+        late = rows.time_s[old[0]] > target_s
+        if not np.count_nonzero(late):
+            return old, new
+        previous = rows.previous[old]
+        go = late & (previous >= 0).all(axis=0)
+        if not np.count_nonzero(go):
+            return old, new
+        old, new = np.where(go, previous, old), np.where(go, old, new)

@@ -1,8 +1,8 @@
-"""What a model file says about itself: class names, input size, task.
+"""Metadata of a model file: class names, input size, task.
 
-Ultralytics writes its facts as text into the ONNX metadata map (each value a Python literal) and as
-JSON in front of a TensorRT engine. Both come here as one mapping; a value may be text or already a
-value. Nothing is evaluated: `ast.literal_eval` accepts literals only.
+Ultralytics writes metadata as text into the ONNX metadata map (each value a Python literal) and as
+JSON in front of a TensorRT engine. Both become one mapping here; a value may be text or already
+decoded. Nothing is evaluated: `ast.literal_eval` accepts literals only.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ _LONGEST_LITERAL = 1 << 20
 _DEFAULT_SIZE = 640  #: Ultralytics' default, where neither the shape nor the metadata names one
 _LARGEST_SIDE = 16384
 _COARSEST = 32  #: YOLO networks want sides that are multiples of their largest stride
-#: Grey above and below the region, together: whom the picture's edge cuts off was learnt with grey
-#: beyond it, too.
+#: Padding above and below the region, together: the network has learnt persons cut off by the edge
+#: with padding beyond it.
 _EDGE_PX = 12
 _INPUT_TYPES = (np.dtype(np.float32), np.dtype(np.float16), np.dtype(np.uint8))
 
 
 @dataclass(frozen=True)
 class ModelMetadata:
-    """The facts of a model's metadata that bikeped uses; None where it says nothing."""
+    """The metadata that bikeped uses; None where the file has none."""
 
     names: tuple[str, ...] | None = None  #: class names in order of their index
     image_size: tuple[int, int] | None = None  #: width, height
@@ -61,10 +61,9 @@ class InputSpec:
 
 
 def parse_metadata(entries: Mapping[str, object], source: str) -> ModelMetadata:
-    """The facts in a model's metadata map. Raises `DetectorError` where the class names are bad.
+    """Parses a model's metadata map. Raises `DetectorError` for malformed class names.
 
-    Malformed names are refused rather than passed over: guessing the names of classes could turn
-    pedestrians into something else.
+    They are not ignored: guessed names could turn pedestrians into something else.
     """
     arguments = _literal(entries.get("args"))
     nms_inside = isinstance(arguments, Mapping) and arguments.get("nms") is True
@@ -91,10 +90,9 @@ def resolve_input(
 ) -> InputSpec:
     """The input with every dynamic dimension filled in.
 
-    `shape` is as the runtime gives it: integers, and names, None or -1 where dynamic. A dynamic
-    height or width is the metadata's `imgsz`, else 640; with `region` a dynamic height is no more
-    than holds the region, which fills the input's width. Raises `DetectorError` for any other
-    input.
+    `shape` is the runtime's: integers, and names, None or -1 where dynamic. A dynamic height or
+    width is the metadata's `imgsz`, else 640; with `region` a dynamic height is at most what the
+    region needs at the input's width. Raises `DetectorError` for any other input.
     """
     if len(shape) != 4:
         raise DetectorError(
@@ -113,14 +111,12 @@ def resolve_input(
     known_width, known_height = metadata.image_size or (_DEFAULT_SIZE, _DEFAULT_SIZE)
     width, height = width or known_width, height or known_height
     if region is not None and is_free(shape):
-        shape_of_it = region.aspect * (region.right - region.left) / (region.bottom - region.top)
-        rows = width / shape_of_it
-        wanted = math.ceil((rows + _EDGE_PX) / _COARSEST) * _COARSEST
+        aspect = region.aspect * (region.right - region.left) / (region.bottom - region.top)
+        wanted = math.ceil((width / aspect + _EDGE_PX) / _COARSEST) * _COARSEST
         height = min(wanted, max(height, _COARSEST))
     if not (32 <= width <= _LARGEST_SIDE and 32 <= height <= _LARGEST_SIDE):
         raise DetectorError(
-            f"{source}: input {name} is {width} x {height}; sides of 32 to {_LARGEST_SIDE} can be "
-            "served"
+            f"{source}: input {name} is {width} x {height}; sides must be 32 to {_LARGEST_SIDE}"
         )
     kind = np.dtype(dtype)
     if kind not in _INPUT_TYPES:
@@ -131,22 +127,22 @@ def resolve_input(
 
 
 def is_free(shape: Sequence[object]) -> bool:
-    """Whether the input's height may be chosen, whatever its width: not where they share a name."""
+    """Whether the input's height is free, independent of its width (they share no name)."""
     if len(shape) != 4 or (isinstance(shape[2], int) and shape[2] > 0):
         return False
     return not isinstance(shape[2], str) or shape[2] != shape[3]
 
 
 def choose_region(config: DetectionConfig, road: Region | None, free: bool) -> Region | None:
-    """The part of every frame that is shown by `detection.region`, None for all.
+    """The part of every frame that the network sees by `detection.region`, None for all.
 
-    `free` as `is_free` has it.
+    `free` is the result of `is_free`.
     """
     return road if config.region == "road" or (config.region == "auto" and free) else None
 
 
 def _literal(value: object) -> object:
-    """A Python literal out of text; anything that is not text stays; None where it is none."""
+    """The Python literal in a text, None for other text; anything but text stays."""
     if not isinstance(value, str):
         return value
     if len(value) > _LONGEST_LITERAL:

@@ -43,7 +43,7 @@ class OnnxDetector(NetworkDetector):
     def __init__(
         self, path: Path, config: DetectionConfig, model_hash: str, road: Region | None = None
     ) -> None:
-        """Opens and warms up the model; `road` as `load_detector` has it.
+        """Opens and warms up the model; `road` as for `load_detector`.
 
         Raises `DetectorError` where that fails.
         """
@@ -57,10 +57,10 @@ class OnnxBackend:
     def __init__(
         self, path: Path, config: DetectionConfig, model_hash: str, road: Region | None = None
     ) -> None:
-        """`model_hash` names the folder of the engines that TensorRT builds.
+        """`model_hash` names the cache folder of the engines that TensorRT builds.
 
-        ONNX Runtime names a cached engine after the graph, not the weights: without a folder of its
-        own, a retrained model would be answered by the old one's engine.
+        ONNX Runtime names a cached engine after the graph, not the weights: in a common folder, a
+        retrained model would run with the old one's engine.
         """
         self._source = str(path)
         wanted = choose_providers(config.providers, ort.get_available_providers())
@@ -92,7 +92,7 @@ class OnnxBackend:
         self.region = choose_region(config, road, is_free(shape))
         spec = resolve_input(inputs[0].name, shape, kind, self.metadata, self._source, self.region)
         names = {side: size for side, size in zip(shape, spec.shape, strict=True) if _is_name(side)}
-        if names:  # of a known size it is planned better, and TensorRT needs no range of sizes
+        if names:  # a known size is planned better, and TensorRT needs no range of sizes
             self._session = self._open(config, providers, names)
         self.buffer: npt.NDArray[Any] = spec.buffer()
         self._feed = {spec.name: self.buffer}
@@ -109,7 +109,7 @@ class OnnxBackend:
         options.log_severity_level = _ERRORS_ONLY
         if config.threads:
             options.intra_op_num_threads = config.threads
-        # A waiting thread would burn the core on which the next picture is being decoded.
+        # A spinning thread would occupy the core that decodes the next image.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         for name, size in sizes.items():
             options.add_free_dimension_override_by_name(name, size)
@@ -132,7 +132,7 @@ class OnnxBackend:
             answers = self._session.run(self._names, self._feed)
         except Exception as error:  # its errors share no class but this one
             raise DetectorError(f"{self._source}: inference failed: {_line(error)}") from error
-        # An output may also be a list or a map of some operators; those are no detections.
+        # An output may also be a list or a map of some operators; those are not detections.
         return [(name, np.asarray(a)) for name, a in zip(self._names, answers, strict=True)]
 
 

@@ -1,14 +1,14 @@
-"""What the numbers in a network's output mean, by family. Pure: arrays in, arrays out.
+"""Output layouts of YOLO networks: recognition and decoding. Pure: arrays in, arrays out.
 
     yolov5         [1, A, 5 + nc]  cx cy w h objectness classes; three anchors a cell (v5, v7)
     yolov8         [1, 4 + nc, A]  cx cy w h classes; one anchor a cell (v8, v9, v11, v12)
-    end2end        [1, n, 6]       x1 y1 x2 y2 score class, suppressed already (v10, 26)
+    end2end        [1, n, 6]       x1 y1 x2 y2 score class, after suppression (v10, 26)
     yolox          [1, A, 5 + nc]  as yolov5 but one anchor a cell, and raw:
                                    centre (xy + cell) * stride, size exp(wh) * stride
     yolox-decoded  [1, A, 5 + nc]  the same, decoded by the network
 
-Boxes are in pixels of the network's input. A is the sum over strides of the cells that the input
-size implies, which is what tells the families apart where the metadata does not.
+Boxes are in pixels of the network's input. A is the number of cells of all strides, given by the
+input size; it identifies the layout where the metadata does not.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LAYOUTS: tuple[Layout, ...] = ("yolov5", "yolov8", "end2end", "yolox", "yolox-de
 #: Detection heads in use: P3-P5, P3-P6 (the large models), P2-P5 (the small-object ones).
 STRIDE_SETS: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32))
 _V5_ANCHORS_A_CELL = 3
-_END2END_MOST = 1000  #: [1, n, 6] with more rows is a grid of one class, not a finished answer
+_END2END_MOST = 1000  #: [1, n, 6] with more rows is a grid of one class, not an end-to-end output
 _SCORE_SLACK = 1e-3  #: half precision may carry a probability this far past 1
 _ASK = "set detection.layout to one of " + ", ".join(LAYOUTS)
 
@@ -98,11 +98,11 @@ def choose_layout(
     configured: str,
     source: str,
 ) -> LayoutChoice:
-    """The layout of `output`, the network's answer to any picture of input `size` (width, height).
+    """The layout of `output`, the output for any image of input `size` (width, height).
 
     `configured` is `detection.layout`. Metadata, then class names, then the anchor count decide;
-    the two YOLOX layouts have one shape and are told apart by values (see `yolox_is_decoded`).
-    Raises `DetectorError` where nothing or more than one layout fits.
+    the two YOLOX layouts have the same shape and differ in their values (see `yolox_is_decoded`).
+    Raises `DetectorError` where no layout or more than one fits.
     """
     shape = list(output.shape)
     if metadata.task not in (None, "detect"):
@@ -111,7 +111,7 @@ def choose_layout(
         )
     if output.ndim != 3 or shape[0] != 1:
         raise DetectorError(f"{source}: output has shape {shape}; bikeped needs [1, rows, columns]")
-    # A configured layout is held against the shape alone: it may overrule wrong metadata.
+    # A configured layout is checked against the shape alone: it may overrule wrong metadata.
     fits = _fitting(output, size, metadata if configured == "auto" else ModelMetadata())
     if configured != "auto":
         asked = cast(Layout, configured)
@@ -144,11 +144,10 @@ def choose_layout(
 
 
 def yolox_is_decoded(output: npt.NDArray[Any], size: tuple[int, int]) -> bool | None:
-    """Whether a YOLOX answer [1, A, 5 + nc] is decoded; None where the values say neither.
+    """Whether a YOLOX output [1, A, 5 + nc] is decoded; None where the values fit neither.
 
-    A decoded centre lies within a few cells of its own cell whatever the picture; a raw one is an
-    offset of a few units around zero. The median over all cells tells the two apart by an order of
-    magnitude: half of one side of the input lies between them.
+    A decoded centre is within a few cells of its own cell for any image; a raw one is an offset of
+    a few units around zero. Their medians over all cells differ by an order of magnitude.
     """
     strides = strides_of(output.shape[1], size)
     if strides is None:
@@ -158,7 +157,7 @@ def yolox_is_decoded(output: npt.NDArray[Any], size: tuple[int, int]) -> bool | 
         centre = output[0, :, :2].astype(np.float64)
         centre = centre[np.isfinite(centre).all(axis=1)]
         if len(centre) != len(cell):
-            return None  # judged on a whole answer only
+            return None  # only a complete output is conclusive
         from_cell = np.median(np.abs(centre - cell * stride), axis=0)
         from_zero = np.median(np.abs(centre), axis=0)
     near = np.asarray(size) / 8.0
@@ -177,25 +176,18 @@ def decode(
     """Boxes of at least `confidence` whose best class is `wanted`.
 
     `output` as the network gave it; `size` (width, height) of the input; `confidence` one number or
-    one for each class; `wanted` [nc]. Rows with numbers that cannot be (not finite, a probability
+    one for each class; `wanted` [nc]. Rows with invalid numbers (not finite, a probability
     above 1, no area) are dropped. Raises `DetectorError` for another shape than the layout's, and
-    where most rows are not finite or no probabilities: silence would read as an empty street.
+    where most rows are not finite or no probabilities: dropped, they would read as an empty street.
     """
     if output.dtype.kind not in "fiu":
         raise DetectorError(f"{source}: output is {output.dtype}, not numbers")
-    columns = len(wanted) + (4 if layout == "yolov8" else 5)
-    shape = output.shape
-    right = len(shape) == 3 and shape[0] == 1
-    if layout == "end2end":
-        right = right and shape[2] == 6
-    elif layout == "yolov8":
-        right = right and shape[1] == columns
-    else:
-        right = right and shape[2] == columns
-    if not right:
+    shape, classes = output.shape, len(wanted)
+    axis, length = {"end2end": (2, 6), "yolov8": (1, 4 + classes)}.get(layout, (2, 5 + classes))
+    if len(shape) != 3 or shape[0] != 1 or shape[axis] != length:
         raise DetectorError(
             f"{source}: output has shape {list(shape)}, which is not {layout} with "
-            f"{len(wanted)} classes"
+            f"{classes} classes"
         )
     least = np.broadcast_to(np.asarray(confidence, np.float32), wanted.shape)
     with np.errstate(all="ignore"):
@@ -205,13 +197,13 @@ def decode(
             found = _yolov8(output[0], least, wanted, source)
         else:
             found = _with_objectness(output[0], layout, size, least, wanted, source)
-        return _sound(found)
+        return _drop_invalid(found)
 
 
 def _end2end(
     rows: npt.NDArray[Any], least: Float32Array, wanted: BoolArray, source: str
 ) -> Candidates:
-    _believe(rows[:, 4], source)
+    _check_probabilities(rows[:, 4], source)
     rows = rows.astype(np.float32)
     class_number = rows[:, 5]
     known = (class_number > -0.5) & (class_number < len(wanted) - 0.5)
@@ -229,9 +221,9 @@ def _yolov8(
     if len(index) == 0 or table.shape[1] == 0:
         return _none()
     # Cheap first: the best of the few wanted classes, over all anchors. An anchor whose best class
-    # of all is wanted passes this too, so nothing is lost; the full comparison is for the few left.
+    # is wanted passes this, so nothing is lost; the full comparison is for the few left.
     best = table[4 + index].max(axis=0)
-    _believe(best, source)
+    _check_probabilities(best, source)
     few = np.nonzero(best >= least[index].min())[0]
     columns = table[:, few].astype(np.float32)
     return _best_class(_corners(columns[:4].T), columns[4:].T, least, wanted)
@@ -254,7 +246,7 @@ def _with_objectness(
     if not wanted.any() or len(rows) == 0:
         return _none()
     objectness = rows[:, 4]
-    _believe(objectness, source)
+    _check_probabilities(objectness, source)
     # The score is objectness times a probability: it cannot exceed the objectness.
     few = np.nonzero(objectness >= least[wanted].min())[0]
     chosen = rows[few].astype(np.float32)
@@ -271,7 +263,7 @@ def _with_objectness(
 def _best_class(
     box: Float32Array, scores: Float32Array, least: Float32Array, wanted: BoolArray
 ) -> Candidates:
-    """One class a box: the best of all; kept where that one is wanted and strong enough."""
+    """One class a box, its best; kept where that is wanted and strong enough."""
     if len(scores) == 0:
         return _none()
     class_id = scores.argmax(axis=1)
@@ -280,8 +272,8 @@ def _best_class(
     return Candidates(box[keep], score[keep], class_id[keep].astype(np.int64))
 
 
-def _sound(found: Candidates) -> Candidates:
-    """Without the rows whose numbers cannot be."""
+def _drop_invalid(found: Candidates) -> Candidates:
+    """The candidates without rows of invalid numbers."""
     box, score = found.box, found.score
     keep = np.isfinite(box).all(axis=1) & (score <= 1 + _SCORE_SLACK)
     keep &= (box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1])
@@ -292,7 +284,7 @@ def _sound(found: Candidates) -> Candidates:
     )
 
 
-def _believe(score: npt.NDArray[Any], source: str) -> None:
+def _check_probabilities(score: npt.NDArray[Any], source: str) -> None:
     """Raises `DetectorError` where most of `score` [n] cannot be probabilities."""
     odd = len(score) - np.count_nonzero((score >= -_SCORE_SLACK) & (score <= 1 + _SCORE_SLACK))
     if 2 * odd > len(score):

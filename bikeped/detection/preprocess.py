@@ -1,22 +1,21 @@
-"""A picture onto the network's input: letterbox, channel order, scale; and boxes back again.
+"""Image to network input: letterbox, channel order, scale; and boxes back to the frame.
 
-    ultralytics   RGB / 255, picture centred, rest grey 114
-    yolox         BGR 0..255, picture top left, rest grey 114
-    yolox-legacy  RGB / 255 less ImageNet's mean over its deviation, top left (YOLOX before 0.1.1)
+    ultralytics   RGB / 255, image centred, padding grey 114
+    yolox         BGR 0..255, image top left, padding grey 114
+    yolox-legacy  RGB / 255, ImageNet's mean and deviation, top left (YOLOX before 0.1.1)
 
-The picture may have been decoded at a reduced scale; boxes are mapped with the full frame's size,
-so they land on full-frame pixels whatever the scale was. With a region only that is shown, as if it
-were the whole picture.
+The image may have been decoded at a reduced scale; boxes are mapped with the full frame's size to
+full-frame pixels. With a region only that part is shown, as if it were the whole image.
 
-What it costs is one bilinear resize and one table look-up a channel, straight into the network's
-contiguous input: a byte has 256 values, so the table folds scale, mean and deviation, exactly. Only
-the picture's part is written; the grey rest stays from the frame before.
+The cost is one bilinear resize and one look-up table per channel, written into the network's
+contiguous input: a byte has 256 values, so the table contains scale, mean and deviation exactly.
+Only the image's part is written; the padding stays from the frame before.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -25,7 +24,6 @@ import numpy.typing as npt
 from bikeped.types import Float32Array, FloatArray, ImageArray, Region
 
 Family = Literal["ultralytics", "yolox", "yolox-legacy"]
-FAMILIES: tuple[Family, ...] = get_args(Family)
 
 PAD = 114  #: grey of the letterbox, 0..255
 _IMAGENET_MEAN = (0.485, 0.456, 0.406)  #: red, green, blue, of RGB / 255
@@ -34,18 +32,18 @@ _IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Where a frame, or a part of it, lies on the network's input, in whole pixels of it.
+    """Position of a frame, or of a part of it, in the network's input, in whole input pixels.
 
-    The two axes have their own scale: the picture's part is rounded to whole pixels.
+    Each axis has its own scale, because the image is rounded to whole pixels.
     """
 
     frame_width: int
     frame_height: int
     left: int
     top: int
-    width: int  #: of the picture's part
+    width: int  #: of the image
     height: int
-    #: The part of the frame that lies there: x1, y1, x2, y2 in frame pixels.
+    #: The part of the frame that is shown: x1, y1, x2, y2 in frame pixels.
     shown_px: tuple[float, float, float, float]
 
     @staticmethod
@@ -71,7 +69,7 @@ class Letterbox:
         wide, high = (x2 - x1) * ratio, (y2 - y1) * ratio
         if family == "ultralytics":
             width, height = round(wide), round(high)
-        else:  # YOLOX cuts; the slack keeps 1280 * (416 / 1280) from becoming 415
+        else:  # YOLOX truncates; the slack keeps 1280 * (416 / 1280) from becoming 415
             width, height = int(wide + 1e-6), int(high + 1e-6)
         width, height = min(max(width, 1), across), min(max(height, 1), down)
         centred = family == "ultralytics"
@@ -117,14 +115,14 @@ class Preprocessor:
         self.buffer = buffer
         self.size = (int(buffer.shape[3]), int(buffer.shape[2]))
         self.region = region
-        # Channel of the network -> channel of the picture, which is RGB.
+        # Channel of the network -> channel of the image, which is RGB.
         self._source = (2, 1, 0) if family == "yolox" else (0, 1, 2)
         self._tables = _tables(family, self._source, buffer.dtype)
         # OpenCV has no look-up into half precision: its bits travel as 16-bit integers.
         self._planes = buffer[0].view(np.int16) if buffer.dtype == np.float16 else buffer[0]
         self._letterbox: Letterbox | None = None
         self._copy_size = (0, 0)
-        self._picture: ImageArray = np.zeros((0, 0, 3), np.uint8)
+        self._image: ImageArray = np.zeros((0, 0, 3), np.uint8)
         self._channel: ImageArray = np.zeros((0, 0), np.uint8)
 
     def letterbox(
@@ -153,31 +151,31 @@ class Preprocessor:
     def __call__(self, rgb: ImageArray, frame_width: int, frame_height: int) -> Letterbox:
         """Writes `rgb` [h, w, 3] uint8, of any scale, into the buffer; returns where it lies.
 
-        Raises `ValueError` where `rgb` is no such picture or has another aspect than the frame.
+        Raises `ValueError` where `rgb` is no such image or has another aspect than the frame.
         """
-        _check_picture(rgb, frame_width, frame_height)
+        _check_image(rgb, frame_width, frame_height)
         copy_size = rgb.shape[1], rgb.shape[0]
         box = self.letterbox(frame_width, frame_height, copy_size)
         if box is not self._letterbox:
             for plane, table in zip(self._planes, self._tables, strict=True):
                 plane[...] = table[PAD]
-            self._picture = np.empty((box.height, box.width, 3), np.uint8)
+            self._image = np.empty((box.height, box.width, 3), np.uint8)
             self._channel = np.empty((box.height, box.width), np.uint8)
             self._letterbox, self._copy_size = box, copy_size
         if self.region is not None:
             u1, v1, u2, v2 = self.region.pixels(*copy_size)
             rgb = rgb[v1:v2, u1:u2]
-        picture = rgb
+        image = rgb
         if rgb.shape[:2] != (box.height, box.width):
-            cv2.resize(rgb, (box.width, box.height), dst=self._picture)
-            picture = self._picture
+            cv2.resize(rgb, (box.width, box.height), dst=self._image)
+            image = self._image
         rows, columns = slice(box.top, box.top + box.height), slice(box.left, box.left + box.width)
         for plane, table, source in zip(self._planes, self._tables, self._source, strict=True):
             target = plane[rows, columns]
             if target.dtype == np.uint8:
-                target[...] = picture[:, :, source]
+                target[...] = image[:, :, source]
             else:
-                cv2.extractChannel(picture, source, dst=self._channel)
+                cv2.extractChannel(image, source, dst=self._channel)
                 cv2.LUT(self._channel, table, dst=target)
         return box
 
@@ -201,14 +199,12 @@ def _tables(
     return tables
 
 
-def _check_picture(rgb: ImageArray, frame_width: int, frame_height: int) -> None:
+def _check_image(rgb: ImageArray, frame_width: int, frame_height: int) -> None:
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
-        raise ValueError(
-            f"expected a picture [height, width, 3] uint8, got {rgb.shape} {rgb.dtype}"
-        )
+        raise ValueError(f"expected an image [height, width, 3] uint8, got {rgb.shape} {rgb.dtype}")
     height, width = rgb.shape[:2]
-    # A reduced decode rounds each side up to a whole pixel; more than that is another picture.
+    # A reduced decode rounds each side up to a whole pixel; more than that is another image.
     if abs(width * frame_height - height * frame_width) > 2 * max(frame_width, frame_height):
         raise ValueError(
-            f"a picture of {width} x {height} is not a scaled {frame_width} x {frame_height} frame"
+            f"an image of {width} x {height} is not a scaled {frame_width} x {frame_height} frame"
         )

@@ -110,7 +110,7 @@ class _Problem:
     ) -> None:
         self.like, self.marks, self.free, self.accuracy = camera, marks, free, accuracy
         self.uv_px = np.array([[m.u_px, m.v_px] for m in marks], np.float64).reshape(-1, 2)
-        rows: list[tuple[str, str, int, int, float]] = []
+        rows: list[tuple[str, str, int, int, float]] = []  # mark, quantity, indices, metres
         for i, mark in enumerate(marks):
             for quantity in ("distance", "forward", "right"):
                 value = getattr(mark, f"{quantity}_m")

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bikeped.detection.preprocess import FAMILIES, Letterbox, Preprocessor
+from bikeped.detection.preprocess import Family, Letterbox, Preprocessor
 from bikeped.types import Region
+
+FAMILIES = get_args(Family)
 
 MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
@@ -129,7 +133,7 @@ def test_the_corners_of_the_frame_are_the_corners_of_the_picture():
 )
 def test_what_is_not_the_frame_is_refused(rgb, frame):
     run = Preprocessor("yolox", np.zeros((1, 3, 64, 64), np.float32))
-    with pytest.raises(ValueError, match="picture"):
+    with pytest.raises(ValueError, match="image"):
         run(rgb, *frame)
 
 
