@@ -11,10 +11,10 @@ from prometheus_client import CollectorRegistry
 
 from bikeped.config import LoadedConfig, parse_config
 from bikeped.faults import Fault
+from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.detection_stage import DecodedFrame
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.builders import health_message
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.telemetry.schema import ComponentStatus, Counters, HealthMessage

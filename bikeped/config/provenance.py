@@ -21,14 +21,7 @@ from bikeped.config.schema.decision import DecisionConfig
 from bikeped.models import model_file
 
 #: What turns detections into a state on the pole; the simulation runs the same rule and tracker.
-DECIDING_CODE = (
-    "config/build",
-    "decision",
-    "geometry",
-    "pipeline/ground_mapper",
-    "pipeline/track_and_decide",
-    "tracking",
-)
+DECIDING_CODE = ("config/build", "decision", "geometry", "pipeline/track_and_decide", "tracking")
 #: What the figures of a promotion were measured with.
 MEASURING_CODE = ("lab/scenarios", "lab/simulation", "lab/experiments", "lab/governance")
 

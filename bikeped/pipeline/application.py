@@ -6,8 +6,12 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import msgspec
+from aiohttp import web
+from prometheus_client import CollectorRegistry
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig, road_region
@@ -25,18 +29,36 @@ from bikeped.pipeline.detection_stage import (
 from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, Limits
 from bikeped.pipeline.feed import Feed
 from bikeped.pipeline.frame_result import FrameResultListener
-from bikeped.pipeline.health_report import report_health
 from bikeped.pipeline.loop import Loop
-from bikeped.pipeline.signal_dispatcher import SignalDispatcher
-from bikeped.pipeline.telemetry import Telemetry
+from bikeped.pipeline.signal_dispatcher import SignalDispatcher, SignalListener
+from bikeped.pipeline.telemetry import Telemetry, report_health
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.pipeline.web_context import Pages, WebContext
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import rfc3339
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.metrics import Metrics
-from bikeped.telemetry.mqtt import MqttPublisher
+from bikeped.telemetry.mqtt import MqttPublisher, MqttStatus
 from bikeped.telemetry.schema import EventHeader, HealthMessage
+
+
+@dataclass(frozen=True)
+class WebContext:
+    """What pages may read. Nothing here changes what the service does."""
+
+    loaded: LoadedConfig
+    track_and_decide: TrackAndDecide
+    source: str  #: the camera, or the recording
+    detector: str
+    health: Callable[[], HealthMessage]
+    metrics: CollectorRegistry
+    mqtt: Callable[[], MqttStatus] | None  #: None: no broker is configured
+
+
+class Pages(FrameResultListener, SignalListener, Protocol):
+    """Pages take every result and every signal, queue them, and return at once."""
+
+    def application(self, web_context: WebContext) -> web.Application:
+        """The web application, with the monitoring endpoints."""
 
 
 def load_detector_pool(loaded: LoadedConfig, *, recorded: bool = False) -> DetectorPool:

@@ -32,7 +32,7 @@ from bikeped.feedback.sounds import make_wav
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import load_detector_pool
 from bikeped.pipeline.detection_stage import DecodedFrame
-from bikeped.pipeline.ground_mapper import GroundMapper
+from bikeped.pipeline.track_and_decide import GroundMapper
 from bikeped.telemetry.mqtt_auth import load_credentials
 from bikeped.telemetry.mqtt_connection import BrokerConnection
 from bikeped.types import Frame, Sound

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from bikeped.errors import GeometryError
 from bikeped.faults import Effect, Fault
 from bikeped.pipeline.feed import Feed
-from bikeped.pipeline.worker_threads import WorkerThread
+from bikeped.pipeline.runtime import WorkerThread
 
 #: Frames that do not decode for this long: the camera is opened anew.
 RESTART_AFTER_S = 5.0

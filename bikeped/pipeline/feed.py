@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from bikeped.capture import FrameGrabber, FrameSource, open_source
 from bikeped.config import CameraConfig
-from bikeped.pipeline.worker_threads import WorkerThread
+from bikeped.pipeline.runtime import WorkerThread
 from bikeped.types import Frame
 
 

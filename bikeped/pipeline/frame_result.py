@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from bikeped.detection.base import DetectionResult
+from bikeped.overlay import GroundToFrame, OverlayData, ground_projector
 from bikeped.pipeline.detection_stage import DecodedFrame
-from bikeped.pipeline.rate_limited_log import RateLimitedLogger
-from bikeped.pipeline.track_and_decide import TrackingResult
+from bikeped.pipeline.runtime import RateLimitedLogger
+from bikeped.pipeline.track_and_decide import TrackAndDecide, TrackingResult
 from bikeped.types import Detections, Signal
 
 log = logging.getLogger(__name__)
@@ -93,3 +96,26 @@ def stage_latencies(
         "total": total_ms,
         "capture_age": total_ms + decoded.acquire_ms,
     }
+
+
+def frame_overlay(
+    result: FrameResult, track_and_decide: TrackAndDecide, signal: Signal | None = None
+) -> tuple[OverlayData, GroundToFrame]:
+    """The data to draw, and the projection of ground points into the frame.
+
+    `signal` None: shown as the decision's state. Call it on the event loop: the tracker's history
+    changes with the next frame.
+    """
+    frame, tracking = result.decoded.frame, result.tracking
+    data = OverlayData(
+        detections=result.detections,
+        tracks=tracking.tracks,
+        decision=tracking.decision,
+        frame_number=frame.number,
+        time_s=result.t_s,
+        signal=signal,
+        latency_s=result.latency_ms["total"] / 1e3,
+        history={key: np.asarray(xy) for key, xy in track_and_decide.tracker.history().items()},
+    )
+    mapper = track_and_decide.ground_mapper
+    return data, ground_projector(mapper.camera, mapper.framing_for(frame.width, frame.height))

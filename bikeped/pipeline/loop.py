@@ -30,7 +30,7 @@ from bikeped.pipeline.frame_result import (
     FrameResultListener,
     stage_latencies,
 )
-from bikeped.pipeline.rate_limited_log import RateLimitedLogger
+from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 

@@ -17,15 +17,13 @@ from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback import LightDriver, SimulatedLight
 from bikeped.overlay import VideoWriter
-from bikeped.pipeline.application import Application, load_detector_pool, new_event_header
+from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector
 from bikeped.pipeline.feed import RecordedFeed, open_configured
 from bikeped.pipeline.frame_result import FrameResultListener
-from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.replay_outputs import OVERLAY_SIZE, EventFile, OverlayVideo, ReplaySummary
-from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.pipeline.web_context import Pages
+from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
 from bikeped.telemetry.latency import StageTimes
 
 log = logging.getLogger(__name__)

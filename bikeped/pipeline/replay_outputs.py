@@ -11,8 +11,7 @@ from typing import Any
 
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.overlay import VideoWriter, compose
-from bikeped.pipeline.frame_overlay import frame_overlay
-from bikeped.pipeline.frame_result import FrameResult
+from bikeped.pipeline.frame_result import FrameResult, frame_overlay
 from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.events import EventWriter

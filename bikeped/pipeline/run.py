@@ -18,17 +18,14 @@ from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
 from bikeped.feedback import LightDriver, Speaker, fault_signal, light_driver
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
-from bikeped.pipeline.application import Application, load_detector_pool, new_event_header
+from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed, open_configured
-from bikeped.pipeline.ground_mapper import GroundMapper
 from bikeped.pipeline.loop import Loop
+from bikeped.pipeline.runtime import Notifier, WorkerThread
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
-from bikeped.pipeline.systemd import Notifier
-from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.pipeline.web_context import Pages
-from bikeped.pipeline.worker_threads import WorkerThread
+from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
 from bikeped.telemetry.audit import AuditLog
 
 log = logging.getLogger(__name__)

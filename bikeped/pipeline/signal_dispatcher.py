@@ -8,7 +8,7 @@ from typing import Protocol
 
 from bikeped.faults import Fault, fault_texts
 from bikeped.feedback import OFF, LightDriver, SignalLogic, Speaker
-from bikeped.pipeline.rate_limited_log import RateLimitedLogger
+from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.types import Decision, Signal
 
 log = logging.getLogger(__name__)

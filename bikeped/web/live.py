@@ -18,7 +18,7 @@ import msgspec
 from aiohttp import hdrs, web
 
 from bikeped.config import WebConfig
-from bikeped.pipeline.web_context import WebContext
+from bikeped.pipeline.application import WebContext
 from bikeped.telemetry.latency import STAGES
 from bikeped.web.live_picture import PictureRenderer
 from bikeped.web.live_state import LiveState

@@ -19,11 +19,9 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.errors import CaptureError
 from bikeped.overlay import GroundToFrame, OverlayData, draw_overlay, encode_jpeg
-from bikeped.pipeline.frame_overlay import frame_overlay
-from bikeped.pipeline.frame_result import FrameResult
-from bikeped.pipeline.rate_limited_log import RateLimitedLogger
+from bikeped.pipeline.frame_result import FrameResult, frame_overlay
+from bikeped.pipeline.runtime import RateLimitedLogger, WorkerThread
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.pipeline.worker_threads import WorkerThread
 from bikeped.types import ImageArray
 from bikeped.web.live_state import LiveState
 

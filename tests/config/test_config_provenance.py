@@ -81,7 +81,7 @@ def test_all_code_that_decides_on_the_pole_is_covered():
     root = Path(__file__).parents[2] / "bikeped"
     for part in (*DECIDING_CODE, *MEASURING_CODE):
         assert (root / part).is_dir() or (root / f"{part}.py").is_file(), part
-    needed = {"config/build", "pipeline/track_and_decide", "pipeline/ground_mapper"}
+    needed = {"config/build", "pipeline/track_and_decide"}
     assert needed <= set(DECIDING_CODE)
     assert {"decision", "geometry", "tracking"} <= set(DECIDING_CODE)
     assert code_hash() != code_hash((*DECIDING_CODE, *MEASURING_CODE))

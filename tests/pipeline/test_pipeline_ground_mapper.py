@@ -5,7 +5,7 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.errors import GeometryError
-from bikeped.pipeline.ground_mapper import GroundMapper
+from bikeped.pipeline.track_and_decide import GroundMapper
 from bikeped.types import Detections, Kind
 
 

@@ -16,9 +16,7 @@ from bikeped.capture import FrameGrabber, open_source
 from bikeped.errors import CaptureError
 from bikeped.pipeline.detection_stage import DetectionStage
 from bikeped.pipeline.feed import LiveFeed, RecordedFeed
-from bikeped.pipeline.rate_limited_log import RateLimitedLogger
-from bikeped.pipeline.systemd import Notifier
-from bikeped.pipeline.worker_threads import WorkerThread
+from bikeped.pipeline.runtime import Notifier, RateLimitedLogger, WorkerThread
 from bikeped.types import Frame
 
 

@@ -13,9 +13,8 @@ from prometheus_client import generate_latest
 from bikeped.errors import DetectorError
 from bikeped.faults import FAULT_KINDS, Clears, Effect, Fault, FaultKind, Severity
 from bikeped.feedback import SignalLogic
-from bikeped.pipeline.health_report import health_line, report_health
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
-from bikeped.pipeline.telemetry import Telemetry
+from bikeped.pipeline.telemetry import Telemetry, health_line, report_health
 from bikeped.telemetry.builders import encode
 from bikeped.telemetry.metrics import Metrics
 from bikeped.types import Colour, Kind, Signal

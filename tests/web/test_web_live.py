@@ -17,8 +17,8 @@ from aiohttp import web
 from web_fakes import OPEN, SIGNALS, Scene, small, web_context
 
 from bikeped.config import load_config
+from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.replay import replay
-from bikeped.pipeline.web_context import WebContext
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.mqtt import MqttStatus

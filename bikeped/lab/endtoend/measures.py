@@ -12,7 +12,7 @@ from bikeped.config import LoadedConfig
 from bikeped.lab.endtoend.matching import MIN_VISIBLE, match_detections
 from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.simulation.perception import PerceptionResult
-from bikeped.pipeline.ground_mapper import GroundMapper
+from bikeped.pipeline.track_and_decide import GroundMapper
 from bikeped.types import BoolArray, Detections, FloatArray, Kind
 
 #: Bounds of the distance rings, metres from the camera.

@@ -37,7 +37,7 @@ from bikeped.lab.calibration.solver.model_comparison import (
 )
 from bikeped.lab.calibration.solver.observations import OutlierCorner, prepare_observations
 from bikeped.lab.simulation.suite import Suite
-from bikeped.pipeline.ground_mapper import GroundMapper
+from bikeped.pipeline.track_and_decide import GroundMapper
 
 FRAMING = Framing(3840, 2160, 3840, 3500)
 K = (0.01, -0.012, 0.004, -0.0007)

@@ -1,0 +1,154 @@
+"""What the service needs of its process: threads, limited log lines, messages to systemd."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import functools
+import logging
+import os
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+log = logging.getLogger(__name__)
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_Job = tuple["concurrent.futures.Future[Any]", Callable[[], Any]]
+
+
+class WorkerThread:
+    """One daemon thread that runs calls one after another and measures the one in progress.
+
+    Not a ThreadPoolExecutor: Python joins an executor's threads when it exits, so one call that
+    hangs in a driver would keep the process from ending and systemd from starting a fresh one.
+    """
+
+    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._busy_since_s: float | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(
+        self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
+    ) -> asyncio.Future[T]:
+        """Calls `function` in the thread; the future is the running event loop's."""
+        future: concurrent.futures.Future[T] = concurrent.futures.Future()
+        self._jobs.put((future, functools.partial(function, *args, **kwargs)))
+        return asyncio.wrap_future(future)
+
+    def busy_s(self, now_s: float) -> float:
+        """Seconds since the call in progress began; 0 when there is none."""
+        since_s = self._busy_since_s
+        return 0.0 if since_s is None else max(0.0, now_s - since_s)
+
+    async def close(self, timeout_s: float = 2.0) -> bool:
+        """Ends the thread after its queued calls; False when it hangs and is left behind."""
+        self._jobs.put(None)
+        await asyncio.to_thread(self._thread.join, timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            future, call = job
+            if not future.set_running_or_notify_cancel():
+                continue
+            self._busy_since_s = self._clock()
+            try:
+                result = call()
+            except BaseException as error:  # noqa: BLE001 - it belongs to the caller
+                self._busy_since_s = None
+                future.set_exception(error)
+            else:
+                self._busy_since_s = None
+                future.set_result(result)
+                del result
+            # Frees the call with its frame before waiting for the next one.
+            del future, call, job
+
+
+class RateLimitedLogger:
+    """Logs at most one line a subject every `every_s` seconds, and how many it suppressed.
+
+    For events that may come thirty times a second for months.
+    """
+
+    def __init__(
+        self,
+        log: logging.Logger,
+        every_s: float = 10.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._log, self._every_s, self._clock = log, every_s, clock
+        self._logged: dict[str, tuple[float, int]] = {}
+
+    def warn(self, subject: str, text: str) -> None:
+        """A warning of an expected event."""
+        suppressed = self._due(subject)
+        if suppressed is not None:
+            self._log.warning("%s%s", text, suppressed)
+
+    def failure(self, subject: str, error: BaseException) -> None:
+        """An unexpected error, with its traceback."""
+        suppressed = self._due(subject)
+        if suppressed is not None:
+            self._log.error("%s: %s%s", subject, error, suppressed, exc_info=error)
+
+    def _due(self, subject: str) -> str | None:
+        now_s = self._clock()
+        logged_s, suppressed = self._logged.get(subject, (None, 0))
+        if logged_s is not None and now_s - logged_s < self._every_s:
+            self._logged[subject] = (logged_s, suppressed + 1)
+            return None
+        self._logged[subject] = (now_s, 0)
+        return f" (and {suppressed} more since the last such line)" if suppressed else ""
+
+
+class Notifier:
+    """sd_notify(3): datagrams on $NOTIFY_SOCKET; without a service manager, calls do nothing."""
+
+    def __init__(self, address: str | None = None) -> None:
+        name = address if address is not None else os.environ.get("NOTIFY_SOCKET", "")
+        # An abstract socket is written with an @ and addressed with a NUL (sd_notify(3)).
+        self._address = "\0" + name[1:] if name.startswith("@") else name
+        self._socket: socket.socket | None = None
+        if self._address:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+            self._socket.setblocking(False)
+
+    def ready(self, status: str) -> None:
+        self._send(f"READY=1\nSTATUS={status}")
+
+    def status(self, status: str) -> None:
+        self._send(f"STATUS={status}")
+
+    def alive(self) -> None:
+        """Feeds the watchdog."""
+        self._send("WATCHDOG=1")
+
+    def starting(self, more_s: float, status: str) -> None:
+        """Asks for `more_s` more seconds to start, as building an engine takes minutes."""
+        self._send(f"EXTEND_TIMEOUT_USEC={round(more_s * 1e6)}\nWATCHDOG=1\nSTATUS={status}")
+
+    def stopping(self) -> None:
+        self._send("STOPPING=1")
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _send(self, message: str) -> None:
+        if self._socket is None:
+            return
+        try:
+            self._socket.sendto(message.encode(), self._address)
+        except OSError as error:  # never a reason to stop the service
+            log.debug("systemd: %s", error)
