@@ -43,8 +43,7 @@ ensure_env() {
   fi
 }
 
-# ensure_cpu_torch FOLDER: PyTorch's CPU build in that virtual environment. On x86-64 the plain package
-# brings several gigabytes of CUDA libraries; elsewhere it is the CPU build.
+# ensure_cpu_torch FOLDER: PyTorch's CPU build there. On x86-64 the plain package brings gigabytes of CUDA.
 ensure_cpu_torch() {
   local pin
   ensure_venv "$1"
@@ -54,9 +53,8 @@ ensure_cpu_torch() {
   say "installing $pin into $1"
   "$1/bin/python" -m pip install --quiet --disable-pip-version-check \
     --constraint scripts/constraints.txt "$pin" && return
-  say "pip finds no $pin. Name PyTorch's index of CPU builds in PIP_EXTRA_INDEX_URL (its install page has"
-  say "the address) or a folder with the wheel in PIP_FIND_LINKS, or accept the CUDA build:"
-  say "  $1/bin/python -m pip install --constraint scripts/constraints.txt torch"
+  say "pip finds no $pin: name PyTorch's index of CPU builds in PIP_EXTRA_INDEX_URL, or a folder that"
+  say "has the wheel in PIP_FIND_LINKS; or install any PyTorch with $1/bin/python -m pip"
   exit 2
 }
 

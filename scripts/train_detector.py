@@ -270,14 +270,9 @@ def experiment(out: Path) -> None:
             write_json(folder / f"{name}.json", {"seconds": round(fitted.seconds, 1)})
         lines[name] = read(folder / f"{name}.json")
     report = folder / "evaluation.json"
-    subprocess.run(
-        [
-            *(sys.executable, "-m", "bikeped.cli.main", "model", "evaluate"),
-            *(f"{name}={folder / name}.onnx" for name in ("ordinary", "augmented")),
-            *(str(folder / "held-out"), "--json", str(report)),
-        ],
-        check=True,
-    )
+    models = [f"{name}={folder / name}.onnx" for name in ("ordinary", "augmented")]
+    command = [sys.executable, "-m", "bikeped.cli.main", "model", "evaluate", *models]
+    subprocess.run([*command, str(folder / "held-out"), "--json", str(report)], check=True)
     for row in read(report)["models"]:
         lines[row["label"]]["road_users"] = row["road_users"]
         lines[row["label"]]["merged"] = row["merged"]
