@@ -1,4 +1,4 @@
-"""What the loop tells the world: MQTT, metrics, audit log, latency figures, health."""
+"""Publishes results and signals: MQTT, metrics, audit log, stage latencies, health."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ log = logging.getLogger(__name__)
 
 
 class Telemetry:
-    """MQTT, metrics, audit log and latency figures. Nothing here waits for anybody.
+    """Listener that feeds MQTT, metrics, audit log and stage latencies; it never blocks.
 
-    `remember`: over how many frames the percentiles are taken.
+    `remember`: number of frames over which the percentiles are taken.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class Telemetry:
             self._mqtt.publish("health", encode(message), retain=True, qos=qos)
 
     def measure(self, loop: Loop, light_errors: int = 0) -> None:
-        """Brings the metrics that no single frame tells up to date."""
+        """Updates the metrics that do not come with a frame."""
         if self._metrics is not None:
             self._metrics.update(
                 fps=self.fps(),
@@ -173,12 +173,12 @@ class Telemetry:
     def _due(self, now_s: float) -> float:
         """The next due time on a fixed grid, so that 0.1 s means ten a second on average."""
         interval_s = self._loaded.config.mqtt.publish_interval_s
-        # After a pause there is nothing to catch up with.
+        # After a pause no messages are made up for.
         return max(self._next_tracks_s + interval_s, now_s + interval_s / 2)
 
 
 def event_line_for(result: FrameResult) -> EventLine:
-    """The event line of an result."""
+    """The event line of a result."""
     return event_line(
         t_s=result.t_s,
         frame=result.decoded.frame.number,

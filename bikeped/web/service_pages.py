@@ -45,5 +45,5 @@ class ServicePages:
         return app
 
     def newest(self) -> Frame | None:
-        """The newest frame that was judged."""
+        """The newest frame with a decision."""
         return None if self.state.result is None else self.state.result.decoded.frame

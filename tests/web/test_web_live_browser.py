@@ -167,14 +167,14 @@ def test_a_moving_replay_from_the_first_frame_to_no_contact(
 # --- the page with a service whose state the test chooses
 
 
-class Told:
-    """A live page's server; it tells what the test wants told, again and again."""
+class LiveServer:
+    """A live page's server that repeats the signal which the test sets."""
 
     def __init__(self, start: Callable[..., Any]) -> None:
         self.within = web_context(small("web.stream_fps=30", "decision.d_min_m=0.1"))
         self.state = LiveState()
         self.scene = Scene(self.within.track_and_decide)
-        self._telling = ("SAFE", "Somebody is here.")
+        self._signal = ("SAFE", "Somebody is here.")
         self.ticks = True
         self.served = start(self._make)
         self.url = self.served.url
@@ -195,7 +195,7 @@ class Told:
 
     async def _tick(self) -> None:
         while True:
-            name, sentence = self._telling
+            name, sentence = self._signal
             if self.ticks:
                 decision = None
                 if self.state.result is not None:
@@ -203,8 +203,8 @@ class Told:
                 self.state.on_signal(SIGNALS[name], sentence, decision)
             await asyncio.sleep(0.05)
 
-    def tell(self, name: str, sentence: str = "Because.") -> None:
-        self._telling = (name, sentence)
+    def set_signal(self, name: str, sentence: str = "Because.") -> None:
+        self._signal = (name, sentence)
 
     def show_frame(self, count: int = 1) -> None:
         async def show() -> None:
@@ -215,15 +215,17 @@ class Told:
 
 
 @pytest.fixture
-def told(start_server: Callable[..., Any]) -> Iterator[Told]:
-    return Told(start_server)
+def live_server(start_server: Callable[..., Any]) -> Iterator[LiveServer]:
+    return LiveServer(start_server)
 
 
 @pytest.mark.parametrize("name", ["IDLE", "SAFE", "WARNING", "ALERT", "FAULT", "OFF"])
-def test_every_state_has_a_word_a_shape_and_a_reason(told, open_page, assert_accessible, name):
-    told.tell(name, f"{name}: because of this")
-    told.show_frame(3)
-    page = open_page(told.url, PHONE)
+def test_every_state_has_a_word_a_shape_and_a_reason(
+    live_server, open_page, assert_accessible, name
+):
+    live_server.set_signal(name, f"{name}: because of this")
+    live_server.show_frame(3)
+    page = open_page(live_server.url, PHONE)
     state = page.locator("#state")
     expect(state).to_have_attribute("data-state", name)
     expect(page.locator("#state-word")).to_have_text(name.capitalize())
@@ -234,8 +236,8 @@ def test_every_state_has_a_word_a_shape_and_a_reason(told, open_page, assert_acc
     assert_accessible(page)
 
 
-def test_no_two_states_share_a_shape(told, open_page):
-    page = open_page(told.url)
+def test_no_two_states_share_a_shape(live_server, open_page):
+    page = open_page(live_server.url)
     shapes = page.evaluate(
         "import('/static/ui.js').then(ui => Object.keys(ui.STATES).map("
         "name => ui.stateIcon(name).outerHTML))"
@@ -246,11 +248,11 @@ def test_no_two_states_share_a_shape(told, open_page):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("viewport", [PHONE, DESKTOP], ids=["phone", "desktop"])
 def test_the_whole_page_is_accessible_and_fits(
-    told, open_page, assert_accessible, viewport, scheme
+    live_server, open_page, assert_accessible, viewport, scheme
 ):
-    told.show_frame(12)
-    told.tell("ALERT", "Cyclist 2 and pedestrian 1 are near one another.")
-    page = open_page(told.url, viewport, scheme)
+    live_server.show_frame(12)
+    live_server.set_signal("ALERT", "Cyclist 2 and pedestrian 1 are near one another.")
+    page = open_page(live_server.url, viewport, scheme)
     expect(page.locator("#tracks tr")).to_have_count(2)
     expect(page.locator("#latency tr")).to_have_count(9)
     expect(page.locator("#health")).to_contain_text("frames/s")
@@ -263,11 +265,11 @@ def test_the_whole_page_is_accessible_and_fits(
     assert small_ones == 0
 
 
-def test_a_fault_says_why_and_is_never_green(told, open_page):
-    told.show_frame()
-    page = open_page(told.url)
+def test_a_fault_says_why_and_is_never_green(live_server, open_page):
+    live_server.show_frame()
+    page = open_page(live_server.url)
     expect(page.locator("#state")).to_have_attribute("data-state", "SAFE")
-    told.tell("FAULT", "camera: no frame for 2.0 s")
+    live_server.set_signal("FAULT", "camera: no frame for 2.0 s")
     expect(page.locator("#state-word")).to_have_text("Fault")
     expect(page.locator("#state-sentence")).to_have_text("Camera: no frame for 2.0 s")
     expect(page.locator("#light-now")).to_have_text("orange, blinking")
@@ -276,61 +278,61 @@ def test_a_fault_says_why_and_is_never_green(told, open_page):
     expect(page.locator("#picture-note")).to_contain_text("old")
 
 
-def test_a_service_that_no_longer_decides_is_no_contact(told, open_page, until):
-    told.show_frame()
-    page = open_page(told.url)
+def test_a_service_that_no_longer_decides_is_no_contact(live_server, open_page, until):
+    live_server.show_frame()
+    page = open_page(live_server.url)
     expect(page.locator("#state")).to_have_attribute("data-state", "SAFE")
-    told.ticks = False  # the server answers, but nothing is decided any more
+    live_server.ticks = False  # the server answers, but nothing is decided any more
     expect(page.locator("#state")).to_have_attribute("data-state", "STALE")
     expect(page.locator("#state-sentence")).to_contain_text("has decided nothing")
     expect(page.locator("#live")).to_have_attribute("data-contact", "lost")
-    told.ticks = True
+    live_server.ticks = True
     expect(page.locator("#state")).to_have_attribute("data-state", "SAFE")
     expect(page.locator("#live")).to_have_attribute("data-contact", "live")
 
 
-def test_a_dead_server_leaves_no_reassuring_colour(told, open_page, page_errors):
-    told.show_frame()
-    page = open_page(told.url)
+def test_a_dead_server_leaves_no_reassuring_colour(live_server, open_page, page_errors):
+    live_server.show_frame()
+    page = open_page(live_server.url)
     expect(page.locator("#state")).to_have_attribute("data-state", "SAFE")
     safe = page.evaluate("getComputedStyle(document.querySelector('#state')).backgroundColor")
-    told.served.stop()
+    live_server.served.stop()
     expect(page.locator("#state-word")).to_have_text("No contact")
     expect(page.locator("#announcer")).to_contain_text("No contact")
     grey = page.evaluate("getComputedStyle(document.querySelector('#state')).backgroundColor")
     assert grey != safe
     red, green, blue = map(int, re.findall(r"\d+", grey)[:3])
     assert max(red, green, blue) - min(red, green, blue) < 12  # grey
-    expect(page.locator("#picture-note")).to_have_text(re.compile("stopped|old"))
+    expect(page.locator("#picture-note")).to_have_text(re.compile("stopped|out of date"))
     assert page.evaluate("getComputedStyle(document.querySelector('.radar')).opacity") < "0.6"
     page_errors(page).clear()
 
 
-def test_markup_in_a_sentence_is_text(told, open_page):
-    told.tell("SAFE", "<img src=x onerror='window.bad=1'><b>bold</b>")
-    page = open_page(told.url)
+def test_markup_in_a_sentence_is_text(live_server, open_page):
+    live_server.set_signal("SAFE", "<img src=x onerror='window.bad=1'><b>bold</b>")
+    page = open_page(live_server.url)
     expect(page.locator("#state-sentence")).to_contain_text("<img src=x")
     assert page.locator("#state-sentence *").count() == 0
     assert page.evaluate("window.bad") is None
 
 
-def test_who_does_not_look_costs_nothing(told, open_page, until):
-    told.show_frame(2)
-    page = open_page(told.url)
+def test_a_hidden_or_paused_page_costs_nothing(live_server, open_page, until):
+    live_server.show_frame(2)
+    page = open_page(live_server.url)
     until(page, f"({LOOK})()")
-    assert (told.live._pages, told.live._streams) == (1, 1)
+    assert (live_server.live._pages, live_server.live._streams) == (1, 1)
 
     def gone() -> None:
-        while told.live._pages or told.live._streams:
-            told.show_frame()
+        while live_server.live._pages or live_server.live._streams:
+            live_server.show_frame()
             page.wait_for_timeout(20)
 
     page.click("#picture-switch")
     expect(page.locator("#picture-note")).to_have_text("Paused: no picture is sent.")
-    while told.live._streams:
-        told.show_frame()
+    while live_server.live._streams:
+        live_server.show_frame()
         page.wait_for_timeout(20)
-    assert told.live._pages == 1
+    assert live_server.live._pages == 1
     page.click("#picture-switch")
     until(page, f"({LOOK})()")
     page.evaluate(
@@ -338,33 +340,35 @@ def test_who_does_not_look_costs_nothing(told, open_page, until):
         "document.dispatchEvent(new Event('visibilitychange'))"
     )
     gone()
-    assert told.live.renderer._drawing is None
+    assert live_server.live.renderer._drawing is None
     page.evaluate(
         "Object.defineProperty(document, 'hidden', {get: () => false, configurable: true});"
         "document.dispatchEvent(new Event('visibilitychange'))"
     )
-    told.show_frame()
+    live_server.show_frame()
     expect(page.locator("#live")).to_have_attribute("data-contact", "live")
 
 
-def test_too_many_viewers_are_told_so(start_server, open_page, page_errors):
-    told = Told(start_server)
-    told.live._config = small("web.max_viewers=1").config.web
-    first = open_page(told.url)
+def test_too_many_viewers_are_refused_with_a_reason(start_server, open_page, page_errors):
+    live_server = LiveServer(start_server)
+    live_server.live._config = small("web.max_viewers=1").config.web
+    first = open_page(live_server.url)
     expect(first.locator("#live")).to_have_attribute("data-contact", "live")
-    second = open_page(told.url)
-    expect(second.locator("#state-sentence")).to_contain_text("As many pages look at this box")
+    second = open_page(live_server.url)
+    expect(second.locator("#state-sentence")).to_contain_text(
+        "The device allows no more live pages"
+    )
     page_errors(second).clear()
     first.close()
     page_errors(second).clear()
 
 
-def test_the_radar_draws_what_the_table_says(told, open_page, until):
+def test_the_radar_draws_what_the_table_says(live_server, open_page, until):
     """A pedestrian 7 m ahead: the mark's colour is where the rings say 7 m is."""
-    told.show_frame(3)
-    page = open_page(told.url)
+    live_server.show_frame(3)
+    page = open_page(live_server.url)
     expect(page.locator("#tracks tr")).to_have_count(2)
-    tracks = told.state.snapshot().tracks
+    tracks = live_server.state.snapshot().tracks
     # The picture of a state is drawn in the browser's next frame, after its table.
     page.wait_for_function(
         """([x, y, colour]) => {

@@ -1,6 +1,6 @@
-"""The demonstration's material: a scripted crossing, and what to say of its replay.
+"""The demonstration: a scripted crossing, and the summary of its replay.
 
-The crossing is drawn by `scene` and looked at by the bundled detector: real pixels, a real model.
+`lab/rendering` draws the crossing, and the bundled detector detects in the drawn pictures.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What happened in a replayed demo, from its events: for people and as JSON."""
+"""Summary of a replayed demo from its event lines, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-#: ALERTs of one pair this close together are one alert, as a person would count them.
+from bikeped.decision.episodes import runs
+
+#: ALERTs of one pair no farther apart than this are one alert.
 MERGE_S = 1.0
 _STATES = ("IDLE", "SAFE", "WARNING", "ALERT")
 
@@ -14,7 +16,7 @@ Event = Mapping[str, Any]
 
 
 def summarise(events: Sequence[Event], scenario: str = "") -> dict[str, Any]:
-    """The summary of `events` (interfaces, Events; a header line without `state` is skipped).
+    """The summary of `events` (docs/messages; a header line without `state` is skipped).
 
     `lead_s` of an alert is the time from its first frame to the closest approach of its pair, as
     tracked: the smallest distance while both are seen, until the pair's next alert. None when the
@@ -27,10 +29,7 @@ def summarise(events: Sequence[Event], scenario: str = "") -> dict[str, Any]:
         for name in _STATES
     }
     alerts = [_alert(frames, first, until) for first, until in _onsets(frames)]
-    order: list[str] = []
-    for event in frames:
-        if not order or order[-1] != event["state"]:
-            order.append(str(event["state"]))
+    order = [str(frames[first]["state"]) for first, _ in runs([e["state"] for e in frames])]
     return {
         "scenario": scenario,
         "frames": count,

@@ -1,17 +1,17 @@
-// The live page. What comes: `hello` once, `now` up to ten times a second, `status` every second,
-// `alerts` and `trend` when there are new ones. When nothing comes, the page says so, in grey.
+// The live page. Server-sent events: `hello` once, `now` up to ten times a second, `status` every
+// second, `alerts` and `trend` when they change. Without events the page turns grey and says so.
 
 import { $, STATES, announce, clock, count, duration, el, fixed, metres, millis, seconds, setText, speed, stateIcon } from "/static/ui.js";
 import { Radar } from "/static/radar.js";
 import { Sparkline } from "/static/sparkline.js";
 
-const PATIENCE_S = 2.5;      // without a message for so long, contact is lost
-const OLD_S = 2;             // a signal or a picture older than this is not of now
+const CONTACT_S = 2.5;       // contact is lost after this long without an event
+const OLD_S = 2;             // a signal or picture older than this is out of date
 const RETRY_S = 3;
-const SAY_S = 3;             // a screen reader hears of changes no faster than this
+const ANNOUNCE_S = 3;        // shortest time between two announcements to screen readers
 const STAGE_WORDS = {
-  acquire: "Read the camera", pre: "Decode, scale", inference: "Detect", post: "Sort out",
-  track: "Track", decide: "Decide", feedback: "Tell the light", total: "All of it", capture_age: "Since capture",
+  acquire: "Capture", pre: "Decode, scale", inference: "Detect", post: "Filter detections",
+  track: "Track", decide: "Decide", feedback: "Set the light", total: "Total", capture_age: "Capture to light",
 };
 
 const radar = new Radar($("#radar"));
@@ -19,34 +19,34 @@ const sparks = new Map();
 const trend = [];
 let hello = null;
 let source = null;
-let heard = null;            // when the last message came
-let shown = null;            // the state on the page
-let since = null;            // since when, by this page's clock
+let lastEvent = null;        // time of the last event
+let shownState = null;
+let shownSince = null;       // since when, by this page's clock
 let lostSince = performance.now();
-let refusal = null;          // why the box does not let us look
+let refusal = null;          // why the device refuses this page
 let retry = null;
-let paused = false;       // the visitor wants no picture
-let broken = false;       // the picture's stream has ended
-let pictureTried = 0;
+let paused = false;          // by the Pause button
+let broken = false;          // the picture's stream has ended
+let pictureStarted = 0;
 
 // --- contact
 
 function connect() {
   if (document.hidden || source !== null) return;
   source = new EventSource("/live/events");
-  const on = (name, take) => source.addEventListener(name, (event) => {
-    heard = performance.now();
-    take(JSON.parse(event.data));
+  const on = (name, handle) => source.addEventListener(name, (event) => {
+    lastEvent = performance.now();
+    handle(JSON.parse(event.data));
   });
-  on("hello", takeHello);
-  on("now", takeNow);
+  on("hello", onHello);
+  on("now", onNow);
   on("alerts", showAlerts);
   on("status", showStatus);
-  on("trend", takeTrend);
+  on("trend", onTrend);
   source.onerror = () => {
     if (source === null || source.readyState !== EventSource.CLOSED) return;
     disconnect();
-    whyNot();
+    findRefusal();
     retry = setTimeout(connect, RETRY_S * 1000);
   };
 }
@@ -57,18 +57,18 @@ function disconnect() {
   source = null;
 }
 
-// The browser does not tell why a stream was refused: ask again, as a page would.
-async function whyNot() {
+// The browser gives no reason for a refused stream: ask for one.
+async function findRefusal() {
   try {
     const answer = await fetch("/live/room", { headers: { Accept: "text/plain" } });
     if (answer.status === 401) location.reload();
-    refusal = answer.status === 503 ? "As many pages look at this box as it allows. Close one." : null;
+    refusal = answer.status === 503 ? "The device allows no more live pages. Close one." : null;
   } catch {
     refusal = null;
   }
 }
 
-function takeHello(data) {
+function onHello(data) {
   refusal = null;
   if (hello !== null && hello.config_hash !== data.config_hash) trend.length = 0;
   hello = data;
@@ -77,12 +77,12 @@ function takeHello(data) {
   startPicture();
 }
 
-function takeNow(data) {
+function onNow(data) {
   const old = data.signal_age_s === null || data.signal_age_s > OLD_S;
   if (old) {
-    lose(data.signal_age_s === null
-      ? "The box has told its light nothing yet."
-      : `The box runs, but has decided nothing for ${duration(data.signal_age_s)}.`);
+    showNoContact(data.signal_age_s === null
+      ? "The device has not set its light yet."
+      : `The device answers, but has decided nothing for ${duration(data.signal_age_s)}.`);
     return;
   }
   $("#live").dataset.contact = "live";
@@ -102,30 +102,30 @@ function lightWords({ colour, blink_hz }) {
   return blink_hz > 0 ? `${colour}, blinking` : colour;
 }
 
-// A dead page must not reassure: no colour of a state, the word, and since when.
-function lose(sentence) {
+// Without contact the page shows no state colour: only that, and since when.
+function showNoContact(sentence) {
   lostSince ??= performance.now();
-  $("#live").dataset.contact = heard === null ? "none" : "lost";
+  $("#live").dataset.contact = lastEvent === null ? "none" : "lost";
   $("#state-facts").hidden = true;
   radar.setLive(false);
   showState("STALE", sentence);
-  if (!paused) setText($("#picture-note"), broken ? "The picture has stopped." : "This picture is old.");
+  if (!paused) setText($("#picture-note"), broken ? "The picture has stopped." : "This picture is out of date.");
 }
 
 setInterval(() => {
   const now = performance.now();
-  if (since !== null) setText($("#state-for"), duration((now - since) / 1000));
-  if (heard !== null && now - heard < PATIENCE_S * 1000) return;
-  const from = heard ?? lostSince ?? now;
-  if (heard === null && refusal === null && now - from < PATIENCE_S * 1000) return;
+  if (shownSince !== null) setText($("#state-for"), duration((now - shownSince) / 1000));
+  if (lastEvent !== null && now - lastEvent < CONTACT_S * 1000) return;
+  const from = lastEvent ?? lostSince ?? now;
+  if (lastEvent === null && refusal === null && now - from < CONTACT_S * 1000) return;
   const ago = duration((now - from) / 1000);
-  lose(refusal ?? (heard === null
-    ? "The box does not answer."
-    : `Nothing has been heard from the box for ${ago}. What stands below is old.`));
+  showNoContact(refusal ?? (lastEvent === null
+    ? "The device does not answer."
+    : `No data from the device for ${ago}. What is shown below is out of date.`));
 }, 500);
 
 document.addEventListener("visibilitychange", () => {
-  // Who does not look costs the box nothing.
+  // A page in the background takes no data.
   if (document.hidden) {
     disconnect();
     stopPicture();
@@ -138,35 +138,35 @@ addEventListener("pageshow", (event) => { if (event.persisted) connect(); });
 
 // --- the state
 
-let saidAt = -Infinity;
-let sayLater = null;
+let announcedAt = -Infinity;
+let pendingAnnouncement = null;
 
-function say(text) {
-  clearTimeout(sayLater);
-  const wait = saidAt + SAY_S * 1000 - performance.now();
+function announceLimited(text) {
+  clearTimeout(pendingAnnouncement);
+  const wait = announcedAt + ANNOUNCE_S * 1000 - performance.now();
   if (wait > 0) {
-    sayLater = setTimeout(() => say(text), wait);
+    pendingAnnouncement = setTimeout(() => announceLimited(text), wait);
     return;
   }
-  saidAt = performance.now();
+  announcedAt = performance.now();
   announce(text);
 }
 
 function showState(name, sentence) {
   const word = STATES[name] ?? name;
-  if (name !== shown) {
-    shown = name;
-    since = performance.now();
+  if (name !== shownState) {
+    shownState = name;
+    shownSince = performance.now();
     $("#state").dataset.state = name;
     $("#state-mark").replaceChildren(stateIcon(name));
     setText($("#state-word"), word);
     document.title = `${word} · Live · bikeped`;
-    say(`${word}. ${sentence}`);
+    announceLimited(`${word}. ${sentence}`);
   }
   setText($("#state-sentence"), withoutName(name, sentence));
 }
 
-// "ALERT: cyclist 3 ..." under the word ALERT says it twice.
+// "ALERT: cyclist 3 ..." under the word ALERT would repeat it.
 function withoutName(name, sentence) {
   const rest = sentence.startsWith(`${name}: `) ? sentence.slice(name.length + 2) : sentence;
   return rest.charAt(0).toUpperCase() + rest.slice(1);
@@ -177,12 +177,12 @@ function withoutName(name, sentence) {
 function startPicture() {
   if (paused || document.hidden) return;
   if (document.readyState !== "complete") {
-    // A stream never ends: begun earlier, it would keep the page from ever being loaded.
+    // A stream never ends: started earlier, it would keep the load event from firing.
     addEventListener("load", startPicture, { once: true });
     return;
   }
   broken = false;
-  pictureTried = performance.now();
+  pictureStarted = performance.now();
   $("#picture").src = `/live/stream?from=${Date.now()}`;
   setText($("#picture-note"), "");
 }
@@ -209,7 +209,7 @@ $("#picture-switch").addEventListener("click", () => {
   paused = !paused;
   const button = $("#picture-switch");
   button.setAttribute("aria-pressed", String(paused));
-  setText(button, paused ? "Go on" : "Pause");
+  setText(button, paused ? "Resume" : "Pause");
   if (paused) {
     stopPicture();
     setText($("#picture-note"), "Paused: no picture is sent.");
@@ -223,7 +223,7 @@ function showPictureAge({ frame_age_s }) {
   $("#picture-frame").toggleAttribute("data-old", old);
   if (paused) return;
   if (broken) {
-    if (performance.now() - pictureTried > RETRY_S * 1000) startPicture();
+    if (performance.now() - pictureStarted > RETRY_S * 1000) startPicture();
     return;
   }
   setText($("#picture-note"), frame_age_s === null ? "No picture yet." : old ? `This picture is ${duration(frame_age_s)} old.` : "");
@@ -237,10 +237,10 @@ function showPair({ pair }) {
   $("#why-none").hidden = !none;
   if (none) return;
   facts($("#why"), [
-    ["Who", `cyclist ${pair.cyclist} and pedestrian ${pair.pedestrian}`],
-    ["Apart", metres(pair.distance_m)],
+    ["Pair", `cyclist ${pair.cyclist} and pedestrian ${pair.pedestrian}`],
+    ["Distance", metres(pair.distance_m)],
     [`${seconds(pair.lookback_s, 2)} before`, metres(pair.distance_then_m, 2)],
-    ["Judged between", `${metres(pair.d_min_m)} and ${metres(pair.d_max_m)}`],
+    ["Rule's limits", `${metres(pair.d_min_m)} and ${metres(pair.d_max_m)}`],
     ["Cyclist", `${speed(pair.speed_mps)}, moved ${metres(pair.displacement_m, 2)}`],
   ]);
 }
@@ -276,7 +276,7 @@ function showTracks({ tracks, pair }) {
     setText(seen, track.unseen_s > 0 ? `${seconds(track.unseen_s)} ago` : "now");
     row.toggleAttribute("data-paired", pair !== null && (track.id === pair.cyclist || track.id === pair.pedestrian));
   });
-  $("#radar").setAttribute("aria-label", order.length === 0 ? "Nobody is seen" : `${order.length} road users from above; the table of road users has the figures`);
+  $("#radar").setAttribute("aria-label", order.length === 0 ? "No road users" : `${order.length} road users; the table of road users has the figures`);
 }
 
 // --- alerts
@@ -294,7 +294,7 @@ function showAlerts(alerts) {
         el("span", { class: lasts ? "going" : "" }, lasts ? "now" : seconds(alert.ended_unix_s - alert.started_unix_s))),
       el("p", {}, withoutName("ALERT", alert.sentence)),
       pair && el("p", { class: "figures" },
-        `${metres(pair.distance_m)} apart at the start${lasts ? "" : `, ${metres(alert.nearest_m)} at the nearest`}; cyclist ${speed(pair.speed_mps)}${lasts ? "" : `; ${count(alert.frames, "frame")}`}`));
+        `${metres(pair.distance_m)} at the start${lasts ? "" : `, ${metres(alert.nearest_m)} at the closest`}; cyclist ${speed(pair.speed_mps)}${lasts ? "" : `; ${count(alert.frames, "frame")}`}`));
   }));
 }
 
@@ -311,11 +311,11 @@ function showStatus({ health, mqtt }) {
     ["Detector", ...part(health.detector)],
     ["Light", ...part(health.light)],
     ["MQTT", ...brokerWords(mqtt)],
-    ["Rate", `${fixed(health.fps, 1)} frames/s`],
+    ["Frame rate", `${fixed(health.fps, 1)} frames/s`],
     ["Newest frame", health.camera.capture_age_ms === null ? "none yet" : `${millis(health.camera.capture_age_ms)} old`],
     ["Since start", `${duration(health.uptime_s)}, ${count(lost.frames, "frame")}, ${count(lost.alerts, "alert")}`],
     ["Lost", `${lost.dropped} replaced, ${lost.undecodable} undecodable, ${lost.failed} failed, ${lost.out_of_order} out of order, ${lost.mqtt_dropped} messages, ${lost.audit_dropped} log lines`],
-    ["Watching", hello?.source ?? "–"],
+    ["Camera source", hello?.source ?? "–"],
     ["Model", hello?.detector ?? "–"],
     ["Rule", hello ? `${hello.rule}, configuration ${hello.config_hash.slice(0, 12)}` : "–"],
     ["Version", health.version],
@@ -350,7 +350,7 @@ function buildLatency(stages) {
   }
 }
 
-function takeTrend(points) {
+function onTrend(points) {
   const last = trend.length ? trend[trend.length - 1].unix_s : -Infinity;
   trend.push(...points.filter((point) => point.unix_s > last));
   while (trend.length > 120) trend.shift();

@@ -1,11 +1,11 @@
-// The plan view: the camera low in the middle, forward up, rings every 5 m. Between two messages the
-// marks move on with their speed, and what a message corrects is taken up within a tenth of a second.
+// The plan view: the camera at the bottom centre, forward up, rings every 5 m. Between two messages
+// the marks move with their velocity; a message's correction is blended in over a tenth of a second.
 
 import { chip, circle, line, polygon, shape, text } from "/static/canvas.js";
 import { calm, canvasOf, colour, metres } from "/static/ui.js";
 
 const BEHIND = 0.2;      // share of the range that is shown behind the camera
-const AHEAD_S = 0.3;     // marks are moved on for so long at most
+const AHEAD_S = 0.3;     // longest extrapolation
 const SETTLE_S = 0.1;
 const TRAIL = 60;        // positions kept of each road user
 
@@ -24,14 +24,14 @@ export class Radar {
   }
 
   describe({ range_m, fov_rad, heading_deg }) {
-    // Where tracks are kept further than the rules look, rings to the horizon would help nobody.
+    // Tracks may be kept farther than the rules reach; farther rings would only shrink the plan.
     this.range = Math.min(range_m, 30);
     this.fov = fov_rad;
     this.heading = heading_deg * Math.PI / 180;
     this.paint();
   }
 
-  // A message's tracks: [{id, kind, x, y, vx, vy, unseen_s}], and the pair that was judged.
+  // A message's tracks: [{id, kind, x, y, vx, vy, unseen_s}], and the deciding pair.
   show(tracks, pair, alerting) {
     const at = performance.now() / 1000;
     const present = new Set();

@@ -1,4 +1,4 @@
-// Two lines over the last minutes: the median, and what 95 of 100 frames stay below.
+// Two lines over the last two minutes: median and 95th percentile.
 
 import { line } from "/static/canvas.js";
 import { canvasOf, colour } from "/static/ui.js";
