@@ -7,10 +7,8 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from typing import Any, cast
-
-import msgspec
+from collections.abc import Callable
+from typing import cast
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig
@@ -35,6 +33,9 @@ from bikeped.telemetry.schema import ComponentStatus, Counters, EventLine, Healt
 from bikeped.types import Decision, Signal, State
 
 log = logging.getLogger(__name__)
+
+LOG_EVERY_S = 60.0  #: between two health lines in the log
+MEASURE_EVERY_S = 1.0  #: between two updates of the metrics
 
 
 class Telemetry:
@@ -190,11 +191,6 @@ def event_line_for(result: FrameResult) -> EventLine:
     )
 
 
-def to_mapping(message: msgspec.Struct) -> Mapping[str, Any]:
-    """A message as plain keys and values, for the HTTP server."""
-    return cast(Mapping[str, Any], msgspec.to_builtins(message))
-
-
 def _status(name: Component, faults: tuple[Fault, ...], detail: str) -> ComponentStatus:
     """Status of one component: its faults, or `detail` where it has none."""
     texts = fault_texts(fault for fault in faults if fault.kind.component == name)
@@ -205,11 +201,6 @@ def _shown(signal: Signal) -> ShownState:
     return cast(ShownState, signal.name)
 
 
-#: A line of latencies in the log this often: enough to look back on, little enough for months.
-LOG_EVERY_S = 60.0
-MEASURE_EVERY_S = 1.0
-
-
 async def report_health(
     telemetry: Telemetry,
     loop: Loop,
@@ -217,7 +208,7 @@ async def report_health(
     interval_s: float,
     light_errors: Callable[[], int] = lambda: 0,
 ) -> None:
-    """Until cancelled. A failure here costs a message, never more."""
+    """Reports health to broker, metrics and log until cancelled. An error costs one report."""
     limited_log = RateLimitedLogger(log)
     next_health_s = next_log_s = -math.inf
     while True:
@@ -237,30 +228,16 @@ async def report_health(
 
 
 def health_line(message: HealthMessage) -> str:
-    """The health in one line of the log."""
+    """The health in one line of the log; of each stage p50, p95 and p99 in ms."""
     counters = message.counters
-    parts = [
-        (
-            f"{message.state}, {message.fps:.1f} frames/s, {counters.frames} processed, "
-            f"{counters.dropped} dropped, {counters.undecodable} undecodable, "
-            f"{counters.failed} failed, {counters.out_of_order} out of order"
-        ),
-        "latency p50/p95/p99 ms: "
-        + latency_line(
-            {
-                stage: {"p50": row.p50, "p95": row.p95, "p99": row.p99}
-                for stage, row in message.latency_ms.items()
-            }
-        ),
-    ]
-    if message.faults:
-        parts.append("faults: " + "; ".join(message.faults))
-    return "health: " + " | ".join(parts)
-
-
-def latency_line(percentiles: Mapping[str, Mapping[str, float]]) -> str:
-    """`acquire 0.5/1.2/1.9, pre ...`: p50, p95 and p99 of each stage."""
-    return ", ".join(
-        f"{stage} {row['p50']:.1f}/{row['p95']:.1f}/{row['p99']:.1f}"
-        for stage, row in percentiles.items()
+    latencies = ", ".join(
+        f"{stage} {row.p50:.1f}/{row.p95:.1f}/{row.p99:.1f}"
+        for stage, row in message.latency_ms.items()
     )
+    line = (
+        f"health: {message.state}, {message.fps:.1f} frames/s, {counters.frames} processed, "
+        f"{counters.dropped} dropped, {counters.undecodable} undecodable, "
+        f"{counters.failed} failed, {counters.out_of_order} out of order | "
+        f"latency p50/p95/p99 ms: {latencies}"
+    )
+    return f"{line} | faults: {'; '.join(message.faults)}" if message.faults else line

@@ -88,17 +88,15 @@ class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ComponentStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One part of the system: does it work, and one line about it."""
+    """Status of one component: whether it works, and one line about it."""
 
     ok: bool
     detail: str
 
 
-class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The camera."""
+class CameraHealth(ComponentStatus, frozen=True, kw_only=True):
+    """Status of the camera."""
 
-    ok: bool
-    detail: str
     capture_age_ms: Annotated[
         float | None, Meta(description="age of the newest frame; null before the first")
     ]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 
+import msgspec
 from aiohttp import web
 
 from bikeped.config import LoadedConfig
 from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.frame_result import FrameResult
-from bikeped.pipeline.telemetry import to_mapping
 from bikeped.telemetry.http_server import add_monitoring
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align
@@ -41,7 +41,7 @@ class ServicePages:
             partial(add_live, live=LivePage(self.state, web_context)),
             partial(add_align, loaded=web_context.loaded, frame=self.newest),
         )
-        add_monitoring(app, web_context.metrics, lambda: to_mapping(web_context.health()))
+        add_monitoring(app, web_context.metrics, lambda: msgspec.to_builtins(web_context.health()))
         return app
 
     def newest(self) -> Frame | None:
