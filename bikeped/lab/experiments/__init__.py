@@ -1,0 +1,1 @@
+"""Experiments on a suite of scenarios, with tables, figures and a report."""

@@ -268,11 +268,11 @@ def warning_budgets(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
             continue
         alert = states[suite.rule_input.frame_slice(index)] == State.ALERT
         onset = onsets(alert) & np.isfinite(truth.budget_s)
-        worst = finite_or_none(metrics.scenario_min_budget_s[index])
+        worst = finite_or_none(metrics.by_scenario["min_warning_budget_s"][index])
         rows.append(
             {
                 "scenario": scenario.name,
-                "mean": finite_or_none(metrics.scenario_mean_budget_s[index]),
+                "mean": finite_or_none(metrics.by_scenario["mean_warning_budget_s"][index]),
                 "min": worst,
                 "onsets": [float(v) for v in truth.budget_s[onset]],
                 "class": budget_class(worst),

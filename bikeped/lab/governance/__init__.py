@@ -1,0 +1,1 @@
+"""Deployment gates, promotion, what-if comparison, risk register, audit records."""

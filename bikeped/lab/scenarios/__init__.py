@@ -1,0 +1,1 @@
+"""Scenario files: scripted encounters of road users, 24 of them bundled."""

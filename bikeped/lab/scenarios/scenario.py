@@ -1,11 +1,11 @@
-"""Scenario files: who moves where and when, in the world frame (x east, y north, metres)."""
+"""Scenario files: paths of road users over time, in the world frame (x east, y north, metres)."""
 
 from __future__ import annotations
 
 import difflib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,9 @@ SIZES_M: dict[str, tuple[float, float, float]] = {
     "truck": (7.0, 2.5, 2.8),
 }
 HAZARDS = ("safe", "standard", "high-speed", "accessibility", "multi-agent", "edge", "non-linear")
-#: A scenario runs on for this long after the last waypoint (definitions, section 4).
+#: A scenario continues for this long after the last waypoint (definitions, section 4).
 TAIL_S = 0.5
+_SIZE_KEYS = ("length", "width", "height")
 _MAX_BYTES = 1_000_000
 _MAX_DURATION_S = 3600.0
 _MAX_COORDINATE_M = 10_000.0
@@ -108,12 +109,9 @@ class Scenario:
         """Times i / fps that are at most `duration_s` (tolerating the last bit)."""
         return np.arange(math.floor(self.duration_s * fps + 1e-6) + 1) / fps
 
-    def renamed(self, name: str) -> Scenario:
-        return replace(self, name=name)
-
 
 def load_scenario(path: Path) -> Scenario:
-    """Reads one scenario file; raises ScenarioError naming the file, the agent and the mend."""
+    """Reads one scenario file; raises ScenarioError naming the file, the agent and the remedy."""
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ScenarioError(f"{path}: larger than 1 MB; a scenario is a short text")
@@ -151,30 +149,30 @@ def bundled_folder() -> Path:
 
 def parse_scenario(text: str, source: str) -> Scenario:
     """A scenario from YAML text; `source` names it in errors."""
+    at = f"{source}: "  # an error begins with the file, then the agent and the key
     try:
         data = load_yaml(text)
     except ValueError as error:
-        raise ScenarioError(f"{source}: {error}; correct it there") from error
-    top = _mapping(data, source, "scenario")
-    _known(top, {"name", "hazard", "expected", "vehicle", "agents", "story"}, source, "")
+        raise ScenarioError(f"{at}{error}; correct it there") from error
+    top = _mapping(data, f"{at}scenario")
+    _check_keys(top, {"name", "hazard", "expected", "vehicle", "agents", "story"}, at)
     name = top.get("name")
     if not isinstance(name, str) or not name.strip():
-        raise ScenarioError(f"{source}: name: expected a text; write name: My Scenario")
+        raise ScenarioError(f"{at}name: expected a text; write name: My Scenario")
     agents_data = top.get("agents")
     if not isinstance(agents_data, list) or not 1 <= len(agents_data) <= _MAX_AGENTS:
-        raise ScenarioError(f"{source}: agents: expected a list of 1 to {_MAX_AGENTS} agents")
-    agents = tuple(_agent(item, source, i) for i, item in enumerate(agents_data))
+        raise ScenarioError(f"{at}agents: expected a list of 1 to {_MAX_AGENTS} agents")
+    agents = tuple(_agent(item, at, i) for i, item in enumerate(agents_data))
     ids = [agent.id for agent in agents]
     twice = next((i for i in ids if ids.count(i) > 1), None)
     if twice is not None:
-        raise ScenarioError(f"{source}: agent {twice}: id is used twice; give each its own")
+        raise ScenarioError(f"{at}agent {twice}: id is used twice; give each its own")
+    states = ("idle", "safe", "warning", "alert")
     return Scenario(
         name=name.strip(),
-        hazard=_choice(top.get("hazard", "standard"), HAZARDS, source, "hazard"),
-        expected=_choice(
-            top.get("expected", "warning"), ("idle", "safe", "warning", "alert"), source, "expected"
-        ),
-        vehicle=_choice(top.get("vehicle", "bicycle"), ("bicycle", "ebike"), source, "vehicle"),
+        hazard=_choice(top.get("hazard", "standard"), HAZARDS, f"{at}hazard"),
+        expected=_choice(top.get("expected", "warning"), states, f"{at}expected"),
+        vehicle=_choice(top.get("vehicle", "bicycle"), ("bicycle", "ebike"), f"{at}vehicle"),
         agents=agents,
         story=" ".join(str(top.get("story", "")).split()),
         source=source,
@@ -193,29 +191,29 @@ def dump_scenario(scenario: Scenario) -> str:
         lines.append(f"story: {_quoted(scenario.story)}")
     lines.append("agents:")
     for agent in scenario.agents:
-        path = ", ".join("[" + ", ".join(map(_real, p)) + "]" for p in agent.path)
+        path = ", ".join("[" + ", ".join(map(_yaml_number, p)) + "]" for p in agent.path)
         size = ""
         if agent.size_m != SIZES_M[agent.kind]:
-            length, width, height = map(_real, agent.size_m)
+            length, width, height = map(_yaml_number, agent.size_m)
             size = f", size: {{length: {length}, width: {width}, height: {height}}}"
         lines.append(f"  - {{id: {agent.id}, kind: {agent.kind}{size}, path: [{path}]}}")
     return "\n".join(lines) + "\n"
 
 
 def _quoted(text: str) -> str:
-    """On one line; not JSON, for YAML folds some characters that JSON leaves as they are."""
+    """A quoted YAML text on one line."""
     dumped: str = yaml.safe_dump(text, default_style='"', allow_unicode=True, width=math.inf)
     return dumped.strip()
 
 
-def _real(number: float) -> str:
-    """Decimal text that YAML reads as the same number: to it, 1e-05 without a dot is a word."""
+def _yaml_number(number: float) -> str:
+    """Decimal text that YAML reads as the same number; it reads 1e-05 without a dot as a text."""
     text = repr(float(number))
     return text if "." in text else text.replace("e", ".0e")
 
 
-def _shown(value: object) -> str:
-    """A value in an error message: one line, not endless."""
+def _short_repr(value: object) -> str:
+    """A value in an error message: one line, at most 60 characters."""
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # a whole number of thousands of digits
@@ -223,81 +221,83 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _mapping(data: object, source: str, what: str) -> Mapping[str, Any]:
+def _mapping(data: object, at: str) -> Mapping[str, Any]:
     if not isinstance(data, dict) or not all(isinstance(key, str) for key in data):
-        raise ScenarioError(f"{source}: {what}: expected keys and values, see the documentation")
+        raise ScenarioError(f"{at}: expected keys and values, see the documentation")
     return data
 
 
-def _known(data: Mapping[str, Any], known: set[str], source: str, where: str) -> None:
+def _check_keys(data: Mapping[str, Any], known: set[str], at: str) -> None:
     for key in data:
         if key not in known:
             near = difflib.get_close_matches(key, sorted(known), 1)
-            mend = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}"
-            name = _shown(key)[1:-1]
-            raise ScenarioError(f"{source}: {where}{name}: unknown key; {mend}")
+            remedy = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}"
+            raise ScenarioError(f"{at}{_short_repr(key)[1:-1]}: unknown key; {remedy}")
 
 
-def _choice(value: object, allowed: tuple[str, ...], source: str, key: str) -> str:
+def _choice(value: object, allowed: tuple[str, ...], at: str) -> str:
     text = value.lower() if isinstance(value, str) else value
     if text not in allowed:
-        raise ScenarioError(f"{source}: {key}: {_shown(value)} is not one of {', '.join(allowed)}")
+        raise ScenarioError(f"{at}: {_short_repr(value)} is not one of {', '.join(allowed)}")
     return str(text)
 
 
-def _agent(item: object, source: str, index: int) -> Agent:
-    data = _mapping(item, source, f"agents[{index}]")
+def _agent(item: object, file: str, index: int) -> Agent:
+    data = _mapping(item, f"{file}agents[{index}]")
     number = data.get("id")
     if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**31:
-        raise ScenarioError(f"{source}: agents[{index}]: id: expected a whole number from 0")
-    where = f"agent {number}: "
-    _known(data, {"id", "kind", "path", "size", "note"}, source, where)
-    kind = _choice(data.get("kind"), tuple(SIZES_M), source, f"{where}kind")
-    points = data.get("path")
+        raise ScenarioError(f"{file}agents[{index}]: id: expected a whole number from 0")
+    at = f"{file}agent {number}: "
+    _check_keys(data, {"id", "kind", "path", "size", "note"}, at)
+    kind = _choice(data.get("kind"), tuple(SIZES_M), f"{at}kind")
+    path = _path(data.get("path"), f"{at}path")
+    return Agent(number, kind, path, _size(data.get("size"), kind, f"{at}size"))
+
+
+def _path(points: object, at: str) -> FloatArray:
+    """Waypoints [n, 3]: t (s), x, y (m)."""
     if not isinstance(points, list) or len(points) < 2:
-        raise ScenarioError(f"{source}: {where}path: needs at least two waypoints [t, x, y]")
+        raise ScenarioError(f"{at}: needs at least two waypoints [t, x, y]")
     rows = []
     for i, point in enumerate(points):
         if not isinstance(point, list) or len(point) != 3:
-            raise ScenarioError(f"{source}: {where}path[{i}]: expected [t, x, y]")
-        rows.append([_number(v, source, f"{where}path[{i}]") for v in point])
+            raise ScenarioError(f"{at}[{i}]: expected [t, x, y]")
+        rows.append([_number(v, f"{at}[{i}]") for v in point])
     path = np.asarray(rows, dtype=np.float64)
     step = np.diff(path[:, 0])
     if not (step > 0).all():
         bad = int(np.argmax(step <= 0)) + 1
         raise ScenarioError(
-            f"{source}: {where}path[{bad}]: time {path[bad, 0]:g} s is not after "
-            f"{path[bad - 1, 0]:g} s; sort the waypoints by time"
+            f"{at}[{bad}]: time {path[bad, 0]:g} s is not after {path[bad - 1, 0]:g} s; sort the "
+            "waypoints by time"
         )
     if path[0, 0] < 0 or path[-1, 0] > _MAX_DURATION_S:
-        raise ScenarioError(f"{source}: {where}path: times must lie in 0 to {_MAX_DURATION_S:g} s")
+        raise ScenarioError(f"{at}: times must lie in 0 to {_MAX_DURATION_S:g} s")
     if np.abs(path[:, 1:]).max() > _MAX_COORDINATE_M:
-        raise ScenarioError(f"{source}: {where}path: a position is over 10 km away; use metres")
-    return Agent(number, kind, path, _size(data.get("size"), kind, source, where))
+        raise ScenarioError(f"{at}: a position is over 10 km away; use metres")
+    return path
 
 
-def _size(value: object, kind: str, source: str, where: str) -> tuple[float, float, float]:
-    default = SIZES_M[kind]
-    if value is None:
-        return default
-    data = _mapping(value, source, f"{where}size")
-    _known(data, {"length", "width", "height"}, source, f"{where}size.")
+def _size(value: object, kind: str, at: str) -> tuple[float, float, float]:
+    """Length, width, height in metres: of `value`, missing ones those of the kind."""
+    data = _mapping({} if value is None else value, at)
+    _check_keys(data, set(_SIZE_KEYS), f"{at}.")
     parts = []
-    for key, usual in zip(("length", "width", "height"), default, strict=True):
-        number = _number(data.get(key, usual), source, f"{where}size.{key}")
+    for key, usual in zip(_SIZE_KEYS, SIZES_M[kind], strict=True):
+        number = _number(data.get(key, usual), f"{at}.{key}")
         if not 0.05 <= number <= 30:
-            raise ScenarioError(f"{source}: {where}size.{key}: {number:g} is not 0.05 to 30 m")
+            raise ScenarioError(f"{at}.{key}: {number:g} is not 0.05 to 30 m")
         parts.append(number)
     return parts[0], parts[1], parts[2]
 
 
-def _number(value: object, source: str, where: str) -> float:
+def _number(value: object, at: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ScenarioError(f"{source}: {where}: {_shown(value)} is not a number")
+        raise ScenarioError(f"{at}: {_short_repr(value)} is not a number")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise ScenarioError(f"{source}: {where}: {_shown(value)} is not a finite number")
+        raise ScenarioError(f"{at}: {_short_repr(value)} is not a finite number")
     return number

@@ -1,0 +1,1 @@
+"""Scenarios through simulated perception, the deployed tracker and rules; metrics."""

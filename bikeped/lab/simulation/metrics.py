@@ -1,13 +1,13 @@
-"""The figures of a run (definitions, section 6), from states and truth. Pure.
+"""Metrics of decisions against ground truth (definitions, section 6). Pure.
 
-Everything is counted over flat arrays of frames, scenario after scenario, so that the optimiser can
-ask thousands of times.
+Everything is counted over flat arrays of frames, scenario after scenario: the optimiser evaluates
+thousands of times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -18,14 +18,14 @@ from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.types import BoolArray, FloatArray, IntArray, State
 
-#: An episode in which a cyclist and a pedestrian came this near is a nuisance, not a false alarm.
+#: An ALERT episode in which a pair came this near is a nuisance, not a false alarm.
 NUISANCE_M = 5.0
 NO_ALERT_LATENCY_S = 5.0
 
 
 @dataclass(frozen=True)
 class GroundTruthFrames:
-    """The truths of several scenarios (or trials), frame after frame."""
+    """The ground truth of several scenarios (or trials), frame after frame."""
 
     start: IntArray
     scenario: IntArray  #: [f] which scenario a frame belongs to
@@ -42,6 +42,10 @@ class GroundTruthFrames:
     @staticmethod
     def join(truths: Sequence[GroundTruth]) -> GroundTruthFrames:
         lengths = np.asarray([len(t.time_s) for t in truths])
+
+        def joined(name: str) -> Any:
+            return np.concatenate([getattr(truth, name) for truth in truths])
+
         closest = [
             float(t.time_s[int(np.argmin(t.nearest_m))])
             if np.isfinite(t.nearest_m).any()
@@ -51,13 +55,13 @@ class GroundTruthFrames:
         return GroundTruthFrames(
             start=np.concatenate([[0], np.cumsum(lengths)[:-1]]),
             scenario=np.repeat(np.arange(len(truths)), lengths),
-            time_s=np.concatenate([t.time_s for t in truths]),
-            danger=np.concatenate([t.danger for t in truths]),
-            actionable=np.concatenate([t.actionable for t in truths]),
-            contact=np.concatenate([t.actionable & np.isfinite(t.ttc_s) for t in truths]),
-            severity=np.concatenate([t.severity for t in truths]),
-            budget_s=np.concatenate([t.budget_s for t in truths]),
-            nearest_m=np.concatenate([t.nearest_m for t in truths]),
+            time_s=joined("time_s"),
+            danger=joined("danger"),
+            actionable=joined("actionable"),
+            contact=joined("actionable") & np.isfinite(joined("ttc_s")),
+            severity=joined("severity"),
+            budget_s=joined("budget_s"),
+            nearest_m=joined("nearest_m"),
             closest_s=np.asarray(closest),
             count=len(truths),
         )
@@ -65,11 +69,12 @@ class GroundTruthFrames:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Totals and per-scenario figures; a figure that has nothing to count is NaN.
+    """Totals and metrics by scenario; NaN where there is nothing to count.
 
-    Per scenario [n]: `sev_fn` (NaN without actionable frames), `fatigue`, `alert_latency_s`
-    (infinite when no ALERT follows, NaN without actionable frames), `mean_budget_s` and
-    `min_budget_s` (NaN without an onset), `first_onset_lead_s` (NaN without an ALERT).
+    `by_scenario` holds arrays [n] by their JSON key: `sensitivity`, `specificity`, `sev_fn` (NaN
+    without actionable frames), `fatigue`, `alert_latency_s` (infinite when no ALERT follows, NaN
+    without actionable frames), `mean_warning_budget_s` and `min_warning_budget_s` (NaN without an
+    onset), `first_onset_lead_s` (NaN without an ALERT).
     """
 
     true_positive: int
@@ -86,55 +91,29 @@ class Metrics:
     adequate_share: float
     false_episodes_per_hour: float
     nuisance_episodes_per_hour: float
-    scenario_sensitivity: FloatArray
-    scenario_specificity: FloatArray
-    scenario_sev_fn: FloatArray
-    scenario_fatigue: FloatArray
-    scenario_alert_latency_s: FloatArray
-    scenario_mean_budget_s: FloatArray
-    scenario_min_budget_s: FloatArray
-    scenario_first_onset_lead_s: FloatArray
+    by_scenario: Mapping[str, FloatArray]
 
     def as_dict(self) -> dict[str, Any]:
-        """The totals for JSON; a figure that is not there is null."""
-        return {
-            "sensitivity": finite_or_none(self.sensitivity),
-            "specificity": finite_or_none(self.specificity),
-            "contact_sensitivity": finite_or_none(self.contact_sensitivity),
-            "sev_fn": finite_or_none(self.sev_fn),
-            "fatigue": finite_or_none(self.fatigue),
-            "mean_alert_latency_s": finite_or_none(self.mean_alert_latency_s),
-            "mean_warning_budget_s": finite_or_none(self.mean_warning_budget_s),
-            "adequate_share": finite_or_none(self.adequate_share),
-            "false_episodes_per_hour": finite_or_none(self.false_episodes_per_hour),
-            "nuisance_episodes_per_hour": finite_or_none(self.nuisance_episodes_per_hour),
-            "true_positive": self.true_positive,
-            "false_positive": self.false_positive,
-            "false_negative": self.false_negative,
-            "true_negative": self.true_negative,
-        }
+        """The totals for JSON: metrics (null: nothing to count), then frame counts."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "by_scenario"}
+        counts = {name: values.pop(name) for name in _COUNTS}
+        return {**{name: finite_or_none(value) for name, value in values.items()}, **counts}
 
     def scenario_dict(self, index: int) -> dict[str, Any]:
-        """One scenario's figures for JSON."""
-        return {
-            "sensitivity": finite_or_none(self.scenario_sensitivity[index]),
-            "specificity": finite_or_none(self.scenario_specificity[index]),
-            "sev_fn": finite_or_none(self.scenario_sev_fn[index]),
-            "fatigue": finite_or_none(self.scenario_fatigue[index]),
-            "alert_latency_s": finite_or_none(self.scenario_alert_latency_s[index]),
-            "mean_warning_budget_s": finite_or_none(self.scenario_mean_budget_s[index]),
-            "min_warning_budget_s": finite_or_none(self.scenario_min_budget_s[index]),
-            "first_onset_lead_s": finite_or_none(self.scenario_first_onset_lead_s[index]),
-        }
+        """One scenario's metrics for JSON."""
+        return {key: finite_or_none(values[index]) for key, values in self.by_scenario.items()}
+
+
+_COUNTS = ("true_positive", "false_positive", "false_negative", "true_negative")
 
 
 def finite_or_none(value: float) -> float | None:
-    """A figure for JSON: null where there is none."""
+    """A number for JSON: null for NaN and infinity."""
     return float(value) if np.isfinite(value) else None
 
 
 def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
-    """All figures of states [f] against the truth of the same frames."""
+    """All metrics of states [f] against the ground truth of the same frames."""
     alert = states == int(State.ALERT)
     n, scenario = truth.count, truth.scenario
 
@@ -182,16 +161,18 @@ def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
         ),
         false_episodes_per_hour=false / hours,
         nuisance_episodes_per_hour=nuisance / hours,
-        scenario_sensitivity=_ratio(tp, tp + fn),
-        scenario_specificity=_ratio(tn, tn + fp),
-        scenario_sev_fn=sev_fn,
-        scenario_fatigue=fatigue,
-        scenario_alert_latency_s=latency,
-        scenario_mean_budget_s=mean_budget,
-        scenario_min_budget_s=min_budget,
-        scenario_first_onset_lead_s=np.where(
-            np.isfinite(first_alert), truth.closest_s - first_alert, np.nan
-        ),
+        by_scenario={
+            "sensitivity": _ratio(tp, tp + fn),
+            "specificity": _ratio(tn, tn + fp),
+            "sev_fn": sev_fn,
+            "fatigue": fatigue,
+            "alert_latency_s": latency,
+            "mean_warning_budget_s": mean_budget,
+            "min_warning_budget_s": min_budget,
+            "first_onset_lead_s": np.where(
+                np.isfinite(first_alert), truth.closest_s - first_alert, np.nan
+            ),
+        },
     )
 
 
@@ -209,7 +190,7 @@ def _alert_latency(truth: GroundTruthFrames, alert: BoolArray) -> FloatArray:
 
 
 def _episodes(truth: GroundTruthFrames, alert: BoolArray, onset: BoolArray) -> tuple[int, int]:
-    """ALERT episodes without a danger frame: false ones, and nuisances (a pair came near)."""
+    """ALERT episodes without a danger frame: (false alarms, nuisances)."""
     if not alert.any():
         return 0, 0
     episode = np.cumsum(onset) - 1

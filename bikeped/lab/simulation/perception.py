@@ -1,12 +1,13 @@
-"""Simulated perception: what the camera makes of the true positions (definitions, sections 3, 7).
+"""Simulated perception of the true positions by the camera (definitions, sections 3 and 7).
 
 Localisation error: the bottom centre of the tightest upright rectangle around an object's visible
-box corners is not its ground point. Projected area: what size-aware recall reads. Loss: independent
-misses, or Gilbert's two-state bursts.
+box corners is not its ground point. Projected area: the input of recall by size. Missed detections:
+independent, or in bursts by Gilbert's two-state channel.
 """
 
 from __future__ import annotations
 
+import itertools
 import zlib
 from dataclasses import dataclass
 from typing import Literal
@@ -27,11 +28,6 @@ OVERALL_RECALL: dict[Kind, float] = {
     Kind.PEDESTRIAN: 0.755,
     Kind.CYCLIST: 0.747,
     Kind.VEHICLE: 0.765,
-}
-AVERAGE_PRECISION: dict[Kind, float] = {
-    Kind.PEDESTRIAN: 0.678,
-    Kind.CYCLIST: 0.657,
-    Kind.VEHICLE: 0.706,
 }
 SIZE_BOUNDS_PX2 = (32.0**2, 96.0**2)
 SIZE_RECALL = (0.514, 0.725, 0.832)
@@ -89,7 +85,7 @@ class PerceptionResult:
 def simulate_perception(
     scenario: Scenario, camera: GroundCamera, pose: CameraPose = SIMULATION_POSE
 ) -> PerceptionResult:
-    """Every agent of every frame as the camera would localise it."""
+    """Every agent of every frame as the camera localises it, in its ground frame at `pose`."""
     time_s = scenario.frame_times()
     frames, agents = len(time_s), len(scenario.agents)
     true = np.full((frames, agents, 2), np.nan)
@@ -124,14 +120,12 @@ def localise(
     length, width, height = size_m
     across = np.stack([-direction[:, 1], direction[:, 0]], -1)
     corners = np.empty((len(xy_m), 8, 3))
-    index = 0
-    for along_sign in (-0.5, 0.5):
-        for across_sign in (-0.5, 0.5):
-            base = xy_m + along_sign * length * direction + across_sign * width * across
-            for top in (0.0, height):
-                corners[:, index, :2] = base
-                corners[:, index, 2] = top
-                index += 1
+    signs = itertools.product((-0.5, 0.5), (-0.5, 0.5), (0.0, height))
+    for index, (along_sign, across_sign, top) in enumerate(signs):
+        corners[:, index, :2] = (
+            xy_m + along_sign * length * direction + across_sign * width * across
+        )
+        corners[:, index, 2] = top
     uv, seen = camera.project(corners)
     some: BoolArray = np.asarray(seen.any(axis=1))
     # Where no corner is seen, a rectangle at the origin stands in; it is not used.
@@ -158,33 +152,20 @@ def error_table(
     degrees and 10 m.
     """
     rows: list[dict[str, float | str]] = []
-    for kind in kinds:
-        for bearing in bearings_deg:
-            for distance in distances_m:
-                angle = np.radians(bearing)
-                xy = np.array([[np.cos(angle), np.sin(angle)]]) * distance
-                put, _ = localise(camera, xy, np.array([[0.0, 1.0]]), SIZES_M[kind])
-                rows.append(
-                    {
-                        "kind": kind,
-                        "distance_m": distance,
-                        "bearing_deg": bearing,
-                        "error_m": float(np.hypot(*(put - xy)[0])),
-                    }
-                )
+    for kind, bearing, distance in itertools.product(kinds, bearings_deg, distances_m):
+        angle = np.radians(bearing)
+        xy = np.array([[np.cos(angle), np.sin(angle)]]) * distance
+        put, _ = localise(camera, xy, np.array([[0.0, 1.0]]), SIZES_M[kind])
+        error_m = float(np.hypot(*(put - xy)[0]))
+        rows.append(
+            {"kind": kind, "distance_m": distance, "bearing_deg": bearing, "error_m": error_m}
+        )
     return rows
 
 
 def trial_generator(seed: int, name: str, trial: int) -> np.random.Generator:
-    """Random numbers of one trial of one scenario, whatever the order and whoever runs it."""
+    """Random numbers of one trial of one scenario, independent of order and process."""
     return np.random.default_rng([seed, zlib.crc32(name.encode()), trial])
-
-
-def misses(
-    recall: FloatArray, present: BoolArray, rng: np.random.Generator, burst: float | None = None
-) -> BoolArray:
-    """Which detections [f, a] of one trial are missed; see `missed_detections`."""
-    return missed_detections(rng.random(recall.shape), recall, present, burst)
 
 
 def missed_detections(

@@ -1,13 +1,14 @@
-"""The deployed tracker, predictor and rules over many scenes at once.
+"""The deployed tracker, predictor and rules over a batch of detection sequences.
 
-A lane is one scene: a scenario, or one Monte Carlo trial of it. All lanes step through the same
-frames in the same tracker; what comes out are track rows, on which the rules are asked once.
+An element of the batch is a scenario, or one Monte Carlo trial of it. All elements step through the
+same frames in one tracker; it gives track rows, on which a rule is evaluated once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,8 @@ SIMULATION_TRACKER = TrackerSettings()
 
 @dataclass(frozen=True)
 class DetectionSequence:
-    """Detections of one lane: positions [f, a, 2] in the camera ground frame, `detected` [f, a]."""
+    """Detections of one batch element: positions [f, a, 2] (m) in the camera ground frame,
+    `detected` [f, a], `kind` [a]; `delay_frames`: how late they reach the tracker."""
 
     xy_m: FloatArray
     detected: BoolArray
@@ -40,12 +42,13 @@ class DetectionSequence:
     delay_frames: int = 0
 
 
+#: The tracker's arrays that a history keeps, in the order of `TrackHistory`.
+_STATE = ("reported", "id", "kind", "xy_m", "velocity_mps", "acceleration_mps2")
+
+
 @dataclass(frozen=True)
 class TrackHistory:
-    """What the tracker reported in every lane and frame, as arrays [f, lane, slot].
-
-    Before prediction: `build_rule_input` makes the rows that the rules read.
-    """
+    """What the tracker reported in every frame, as arrays [f, batch, slot], before prediction."""
 
     reported: BoolArray
     id: IntArray
@@ -53,107 +56,82 @@ class TrackHistory:
     xy_m: FloatArray
     velocity_mps: FloatArray
     acceleration_mps2: FloatArray
-    frames: IntArray  #: [lane]: frames of each lane; later ones are padding
-    delay_frames: IntArray  #: [lane]
+    frames: IntArray  #: [batch]: frames of each element; later ones are padding
+    delay_frames: IntArray  #: [batch]
 
-    @property
-    def lanes(self) -> int:
-        return len(self.frames)
+    def select(self, part: slice) -> TrackHistory:
+        """The history of a part of the batch."""
+        arrays = {name: getattr(self, name)[:, part] for name in _STATE}
+        return TrackHistory(
+            **arrays, frames=self.frames[part], delay_frames=self.delay_frames[part]
+        )
 
 
 def track(
-    scenes: Sequence[DetectionSequence], settings: TrackerSettings = SIMULATION_TRACKER
+    sequences: Sequence[DetectionSequence], settings: TrackerSettings = SIMULATION_TRACKER
 ) -> TrackHistory:
-    """Runs the tracker over all scenes side by side."""
-    lanes = len(scenes)
-    frames = np.asarray([len(s.xy_m) for s in scenes])
+    """Runs the tracker over all sequences side by side."""
+    batch = len(sequences)
+    frames = np.asarray([len(s.xy_m) for s in sequences])
     longest = int(frames.max())
-    agents = max(s.xy_m.shape[1] for s in scenes)
-    xy = np.zeros((longest, lanes, agents, 2))
-    kind = np.full((longest, lanes, agents), -1, np.int8)
-    for lane, scene in enumerate(scenes):
-        late = scene.delay_frames
-        count = len(scene.xy_m) - late
+    agents = max(s.xy_m.shape[1] for s in sequences)
+    xy = np.zeros((longest, batch, agents, 2))
+    kind = np.full((longest, batch, agents), -1, np.int8)
+    for index, sequence in enumerate(sequences):
+        late = sequence.delay_frames
+        count = len(sequence.xy_m) - late
         if count <= 0:
             continue
-        width = scene.xy_m.shape[1]
-        there = scene.detected[:count]
-        xy[late : late + count, lane, :width] = np.where(there[..., None], scene.xy_m[:count], 0.0)
-        kind[late : late + count, lane, :width] = np.where(there, scene.kind, -1)
-    tracker = BatchTracker(settings, lanes, slots=max(2 * agents, 4))
-    history = _history(longest, tracker)
+        at = (slice(late, late + count), index, slice(sequence.xy_m.shape[1]))
+        detected = sequence.detected[:count]
+        xy[at] = np.where(detected[..., None], sequence.xy_m[:count], 0.0)
+        kind[at] = np.where(detected, sequence.kind, -1)
+    tracker = BatchTracker(settings, batch, slots=max(2 * agents, 4))
+    history = _empty_history(longest, tracker)
     for frame in range(longest):
         tracker.update(frame / FPS, xy[frame], kind[frame])
-        if tracker.alive.shape[1] > history[0].shape[2]:
-            old, history = history, _history(longest, tracker)
-            for wide, narrow in zip(history, old, strict=True):
-                wide[:, :, : narrow.shape[2]] = narrow
-        for array, now in zip(history, _arrays(tracker), strict=True):
-            array[frame] = now
-    inside = np.arange(longest)[:, None] < frames[None, :]
-    reported, number, kinds, position, velocity, acceleration = history
-    return TrackHistory(
-        reported=reported & inside[..., None],
-        id=number,
-        kind=kinds,
-        xy_m=position,
-        velocity_mps=velocity,
-        acceleration_mps2=acceleration,
-        frames=frames,
-        delay_frames=np.asarray([s.delay_frames for s in scenes]),
-    )
+        if tracker.alive.shape[1] > history["id"].shape[2]:
+            old, history = history, _empty_history(longest, tracker)
+            for name, narrow in old.items():
+                history[name][:, :, : narrow.shape[2]] = narrow
+        for name, array in history.items():
+            array[frame] = getattr(tracker, name)
+    history["reported"] &= (np.arange(longest)[:, None] < frames[None, :])[..., None]
+    delays = np.asarray([s.delay_frames for s in sequences])
+    return TrackHistory(**history, frames=frames, delay_frames=delays)
 
 
-def delay_history(tracked: TrackHistory, frames: int) -> TrackHistory:
+def delay_history(history: TrackHistory, frames: int) -> TrackHistory:
     """What the tracker reports when the same detections come `frames` frames later.
 
     A tracker knows time differences only, so its report is the same, later; nothing until then.
     """
     if frames == 0:
-        return tracked
-    longest = len(tracked.reported)
+        return history
+    longest = len(history.reported)
     late = min(frames, longest)
-
-    def later(array: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
-        out = np.zeros_like(array)
-        out[late:] = array[: longest - late]
-        return out
-
-    inside = np.arange(longest)[:, None] < tracked.frames[None, :]
-    return replace(
-        tracked,
-        reported=later(tracked.reported) & inside[..., None],
-        id=later(tracked.id),
-        kind=later(tracked.kind),
-        xy_m=later(tracked.xy_m),
-        velocity_mps=later(tracked.velocity_mps),
-        acceleration_mps2=later(tracked.acceleration_mps2),
-        delay_frames=tracked.delay_frames + frames,
-    )
+    arrays = {}
+    for name in _STATE:
+        array = getattr(history, name)
+        arrays[name] = np.zeros_like(array)
+        arrays[name][late:] = array[: longest - late]
+    arrays["reported"] &= (np.arange(longest)[:, None] < history.frames[None, :])[..., None]
+    return replace(history, **arrays, delay_frames=history.delay_frames + frames)
 
 
-def _arrays(tracker: BatchTracker) -> tuple[np.ndarray, ...]:  # type: ignore[type-arg]
-    """What is kept of every frame, in the order of `TrackHistory`."""
-    return (
-        tracker.reported,
-        tracker.id,
-        tracker.kind,
-        tracker.xy_m,
-        tracker.velocity_mps,
-        tracker.acceleration_mps2,
-    )
-
-
-def _history(frames: int, tracker: BatchTracker) -> list[np.ndarray]:  # type: ignore[type-arg]
-    """Room for every frame; made again, wider, when the tracker's slots have grown."""
-    return [np.zeros((frames, *a.shape), a.dtype) for a in _arrays(tracker)]
+def _empty_history(frames: int, tracker: BatchTracker) -> dict[str, Any]:
+    """Arrays for every frame; made again, wider, when the tracker's slots have grown."""
+    arrays = {name: getattr(tracker, name) for name in _STATE}
+    return {name: np.zeros((frames, *a.shape), a.dtype) for name, a in arrays.items()}
 
 
 @dataclass(frozen=True)
 class RuleInput:
-    """Track rows of all lanes with their pairs: what any number of rules can be asked of.
+    """Track rows of the whole batch with their pairs: the input of any number of rules.
 
-    Frames are counted over all lanes in turn: frame `start[lane] + i` is frame i of a lane.
+    Frames are numbered over all elements in turn: `start[index] + i` is frame i of an element.
+    `time_s`, `pedestrian` (one is tracked) and `cyclist_last_s` (time of the last cyclist; -inf
+    before the first) are by frame.
     """
 
     rows: TrackRows
@@ -164,55 +142,58 @@ class RuleInput:
     pedestrian: BoolArray
     cyclist_last_s: FloatArray
 
-    def frame_slice(self, lane: int) -> slice:
-        """Where a lane's frames lie in arrays over all frames."""
-        begin = int(self.start[lane])
-        return slice(begin, begin + int(self.frames[lane]))
+    def frame_slice(self, index: int) -> slice:
+        """Where an element's frames lie in arrays over all frames."""
+        begin = int(self.start[index])
+        return slice(begin, begin + int(self.frames[index]))
 
 
-def build_rule_input(tracked: TrackHistory, order: int = 0) -> RuleInput:
-    """The rows that the rules read, predicted ahead by each lane's delay with `order`."""
-    # Lane-major order, so that a lane's frames are neighbours.
-    reported = tracked.reported.transpose(1, 0, 2)
-    lane, frame, slot = np.nonzero(reported)
-    ids = tracked.id[frame, lane, slot]
+def build_rule_input(history: TrackHistory, order: int = 0) -> RuleInput:
+    """The rows that the rules read, predicted ahead by each element's delay.
+
+    `order` of the prediction: 0 none, 1 velocity, 2 acceleration.
+    """
+    # Element-major order, so that an element's frames are neighbours.
+    reported = history.reported.transpose(1, 0, 2)
+    element, frame, slot = np.nonzero(reported)
+    ids = history.id[frame, element, slot]
     # Within a frame in track order (ascending id): slots are reused, ids are not.
-    # One key and a stable sort: it is quick on what is nearly sorted already.
-    key = (lane * reported.shape[1] + frame) * (int(ids.max(initial=0)) + 1) + ids
+    # One key and a stable sort, which is fast on what is nearly sorted already.
+    key = (element * reported.shape[1] + frame) * (int(ids.max(initial=0)) + 1) + ids
     order_index = np.argsort(key, kind="stable")
-    lane, frame, slot, ids = (a[order_index] for a in (lane, frame, slot, ids))
-    start = np.concatenate([[0], np.cumsum(tracked.frames)[:-1]])
+    element, frame, slot, ids = (a[order_index] for a in (element, frame, slot, ids))
+    start = np.concatenate([[0], np.cumsum(history.frames)[:-1]])
     number = np.full(reported.shape, -1, np.intp)
-    number[lane, frame, slot] = np.arange(len(lane))
-    before = np.where(frame > 0, number[lane, np.maximum(frame - 1, 0), slot], -1)
+    number[element, frame, slot] = np.arange(len(element))
+    before = np.where(frame > 0, number[element, np.maximum(frame - 1, 0), slot], -1)
     same = (before >= 0) & (ids[np.maximum(before, 0)] == ids)
-    total = int(tracked.frames.sum())
-    at = (frame, lane, slot)
+    total = int(history.frames.sum())
+    at = (frame, element, slot)
     rows = TrackRows(
-        frame=(start[lane] + frame).astype(np.intp),
+        frame=(start[element] + frame).astype(np.intp),
         time_s=frame / FPS,
         id=ids,
-        kind=tracked.kind[at],
+        kind=history.kind[at],
         xy_m=predict(
-            tracked.xy_m[at],
-            tracked.velocity_mps[at] if order else tracked.xy_m[:0],
-            tracked.acceleration_mps2[at] if order > 1 else None,
-            (tracked.delay_frames / FPS)[lane][:, None],
+            history.xy_m[at],
+            history.velocity_mps[at] if order else history.xy_m[:0],
+            history.acceleration_mps2[at] if order > 1 else None,
+            (history.delay_frames / FPS)[element][:, None],
             order,
         ),
         previous=np.where(same, before, -1),
     )
-    time_s = np.concatenate([np.arange(n) / FPS for n in tracked.frames])
+    time_s = np.concatenate([np.arange(n) / FPS for n in history.frames])
     cyclist = frame_mask(rows.frame[rows.kind == int(Kind.CYCLIST)], total)
     last = np.where(cyclist, time_s, -np.inf)
-    for begin, count in zip(start, tracked.frames, strict=True):
+    for begin, count in zip(start, history.frames, strict=True):
         part = last[begin : begin + count]
         np.maximum.accumulate(part, out=part)
     return RuleInput(
         rows=rows,
         pairs=pair_rows(rows, total),
         start=start,
-        frames=tracked.frames,
+        frames=history.frames,
         time_s=time_s,
         pedestrian=frame_mask(rows.frame[rows.kind == int(Kind.PEDESTRIAN)], total),
         cyclist_last_s=last,
@@ -220,14 +201,14 @@ def build_rule_input(tracked: TrackHistory, order: int = 0) -> RuleInput:
 
 
 def verdicts(run: RuleInput, settings: RuleSettings) -> PairChecks:
-    """What the rule says of every pair of every frame."""
+    """The rule evaluated for every pair of every frame."""
     return evaluate_rule(run.rows, run.pairs, settings)
 
 
 def states(
     run: RuleInput, settings: RuleSettings
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
-    """State codes of every frame of every lane, lane after lane."""
+    """State codes of every frame, element after element."""
     fired = verdicts(run, settings).fires
     approaching = frame_mask(run.rows.frame[run.pairs.pedestrian_row[fired]], len(run.time_s))
     memory = is_remembered(run.time_s, run.cyclist_last_s, settings.memory_s)

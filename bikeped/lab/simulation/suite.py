@@ -1,4 +1,4 @@
-"""A suite of scenarios through one camera: truth, perception and decisions, each made once."""
+"""A suite of scenarios seen by one camera: ground truth, perception and decisions, cached."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ CONFIGURATIONS: dict[str, DecisionConfig] = {
 
 @dataclass(frozen=True)
 class Suite:
-    """Scenarios, the camera that watches them, and the thresholds of truth."""
+    """Scenarios, the camera and its pose, and the ground-truth thresholds."""
 
     scenarios: tuple[Scenario, ...]
     camera: GroundCamera
@@ -103,7 +103,7 @@ class Suite:
     def detection_sequences(
         self, localisation_error: bool = True, delay_frames: int = 0
     ) -> list[DetectionSequence]:
-        """Every scenario's detections without loss."""
+        """Every scenario's detections without misses."""
         return [
             DetectionSequence(
                 s.observed_m if localisation_error else s.true_m, s.present, s.kind, delay_frames
@@ -113,33 +113,21 @@ class Suite:
 
     @cached_property
     def rule_input(self) -> RuleInput:
-        """Track rows with localisation error, no loss, no latency."""
-        return self._both[0]
+        """Track rows with localisation error, no misses, no latency."""
+        return self._rule_inputs[0]
 
     @cached_property
     def rule_input_without_error(self) -> RuleInput:
-        return self._both[1]
+        return self._rule_inputs[1]
 
     @cached_property
-    def _both(self) -> tuple[RuleInput, RuleInput]:
-        """Both variants in one pass of the tracker, side by side."""
+    def _rule_inputs(self) -> tuple[RuleInput, RuleInput]:
+        """With and without localisation error, in one pass of the tracker."""
         count = len(self.scenarios)
-        tracked = track([*self.detection_sequences(True), *self.detection_sequences(False)])
-        parts = []
-        for lanes in (slice(0, count), slice(count, 2 * count)):
-            part = replace(
-                tracked,
-                reported=tracked.reported[:, lanes],
-                id=tracked.id[:, lanes],
-                kind=tracked.kind[:, lanes],
-                xy_m=tracked.xy_m[:, lanes],
-                velocity_mps=tracked.velocity_mps[:, lanes],
-                acceleration_mps2=tracked.acceleration_mps2[:, lanes],
-                frames=tracked.frames[lanes],
-                delay_frames=tracked.delay_frames[lanes],
-            )
-            parts.append(build_rule_input(part))
-        return parts[0], parts[1]
+        history = track([*self.detection_sequences(True), *self.detection_sequences(False)])
+        parts = slice(0, count), slice(count, 2 * count)
+        with_error, without_error = (build_rule_input(history.select(part)) for part in parts)
+        return with_error, without_error
 
     def states(
         self, decision: DecisionConfig, localisation_error: bool = True
@@ -154,7 +142,7 @@ class Suite:
     def with_truth(self, settings: GroundTruthSettings) -> Suite:
         """The same suite under other thresholds; perception is not computed again."""
         other = replace(self, truth_settings=settings)
-        for name in ("perception_results", "_both", "hash"):
+        for name in ("perception_results", "_rule_inputs", "hash"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
@@ -198,7 +186,7 @@ def compare_json(
 
 
 def camera_json(suite: Suite) -> dict[str, Any]:
-    """The camera in words that a reader of the JSON can check."""
+    """The camera as the JSON records it."""
     camera, pose = suite.camera, suite.pose
     return {
         "projection": camera.lens.projection,

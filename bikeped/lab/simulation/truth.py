@@ -1,13 +1,13 @@
-"""Kinematic ground truth: which frames are dangerous, and can a warning still help? Pure.
+"""Kinematic ground truth: in which frames there is danger, and whether a warning can help. Pure.
 
-Definitions, section 5; paper, section 4.2. Positions come from the scenario's script, so truth
-knows the future that the pole does not: each frame looks 5 s ahead along the scripted paths.
+Definitions, section 5; paper, section 4.2. Positions come from the scenario's script, so ground
+truth knows the future: each frame looks 5 s ahead along the scripted paths.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -99,7 +99,7 @@ class GroundTruth:
 
     @property
     def imminent(self) -> BoolArray:
-        """Danger in which a warning comes too late to be acted upon."""
+        """Danger in which a warning comes too late to act upon."""
         return np.asarray(self.danger & ~self.actionable)
 
 
@@ -113,7 +113,7 @@ def compute_ground_truth(
     cyclists = [a for a in scenario.agents if KIND_OF[a.kind] is Kind.CYCLIST]
     pedestrians = [a for a in scenario.agents if KIND_OF[a.kind] is Kind.PEDESTRIAN]
     paths = {a.id: a.sample(grid_s)[0] for a in (*cyclists, *pedestrians)}
-    best = _Best(frames)
+    best = _PairTruth.none(frames)
     nearest = np.full(frames, np.inf)
     for cyclist in cyclists:
         for pedestrian in pedestrians:
@@ -126,7 +126,7 @@ def compute_ground_truth(
                 settings,
                 settings.braking_of(scenario),
             )
-            best.take(pair, cyclist.id, pedestrian.id)
+            best.replace_where_worse(pair)
             nearest = np.fmin(nearest, pair.distance)
     return GroundTruth(
         time_s=time_s,
@@ -143,14 +143,9 @@ def compute_ground_truth(
     )
 
 
-def severity_of(speed_mps: FloatArray) -> FloatArray:
-    """Kinetic energy against that at 12 m/s, at most 1."""
-    return np.asarray(np.minimum((speed_mps / SEVERITY_SPEED_MPS) ** 2, 1.0))
-
-
 @dataclass(frozen=True)
 class _PairTruth:
-    """One pair over the frames; `considered` where both exist within range."""
+    """One pair over the frames [f]; `considered` where both exist within range."""
 
     considered: BoolArray
     danger: BoolArray
@@ -159,6 +154,28 @@ class _PairTruth:
     d_min: FloatArray
     budget: FloatArray
     distance: FloatArray
+    cyclist: IntArray
+    pedestrian: IntArray
+
+    @staticmethod
+    def none(frames: int) -> _PairTruth:
+        """No pair in any frame."""
+        false, infinite = np.zeros(frames, np.bool_), np.full(frames, np.inf)
+        no_id = np.full(frames, -1, np.int64)
+        arrays: list[Any] = [false, false, np.zeros(frames), *[infinite] * 4, no_id, no_id]
+        return _PairTruth(*(array.copy() for array in arrays))
+
+    def replace_where_worse(self, pair: _PairTruth) -> None:
+        """Takes `pair` in the frames in which it is in danger with a higher severity, or, without
+        danger so far, has a smaller d_min. Of equal pairs the first offered stays."""
+        # Two cyclists of one speed tie, whatever the last bit of their differences is.
+        severer = pair.severity > self.severity + _EPSILON
+        worse_danger = pair.danger & (~self.danger | severer)
+        none_yet = self.cyclist < 0
+        nearer = ~pair.danger & ~self.danger & (none_yet | (pair.d_min < self.d_min - _EPSILON))
+        at = pair.considered & (worse_danger | nearer)
+        for name, values in vars(self).items():
+            values[at] = getattr(pair, name)[at]
 
 
 def _pair(
@@ -174,7 +191,7 @@ def _pair(
     gap = cyclist_xy - pedestrian_xy
     distance = np.sqrt((gap**2).sum(-1))  # NaN where either does not exist
     ahead_of = np.where(np.isnan(distance), np.inf, distance)
-    # Lives are intervals, so what does not exist any more never exists again: infinity is enough.
+    # An agent exists in one interval: after its end the distance stays infinite.
     ahead = ahead_of[frame[:, None] + _SAMPLE_STRIDE * np.arange(_SAMPLES)]
     now = distance[frame]
     considered = now <= PAIR_RANGE_M
@@ -209,11 +226,14 @@ def _pair(
     return _PairTruth(
         considered=considered,
         danger=danger,
-        severity=severity_of(cyclist_speed),
+        # Kinetic energy relative to that at 12 m/s, at most 1.
+        severity=np.minimum((cyclist_speed / SEVERITY_SPEED_MPS) ** 2, 1.0),
         ttc=ttc,
         d_min=d_min,
         budget=budget,
         distance=now,
+        cyclist=np.full(frames, cyclist.id, np.int64),
+        pedestrian=np.full(frames, pedestrian.id, np.int64),
     )
 
 
@@ -221,43 +241,3 @@ def _speed(xy: FloatArray, frame: IntArray) -> FloatArray:
     """Forward difference over 0.05 s; 0 where either end does not exist."""
     step = xy[frame + _SAMPLE_STRIDE] - xy[frame]
     return np.asarray(np.nan_to_num(np.sqrt((step**2).sum(-1)) / SAMPLE_S, nan=0.0))
-
-
-class _Best:
-    """The pair that a frame takes: in danger with the highest severity, else the smallest d_min.
-
-    Pairs are offered in agent order, and only a better one replaces: the first wins a tie.
-    """
-
-    def __init__(self, frames: int) -> None:
-        self.danger: BoolArray = np.zeros(frames, np.bool_)
-        self.severity: FloatArray = np.zeros(frames)
-        self.ttc: FloatArray = np.full(frames, np.inf)
-        self.d_min: FloatArray = np.full(frames, np.inf)
-        self.budget: FloatArray = np.full(frames, np.inf)
-        self.distance: FloatArray = np.full(frames, np.inf)
-        self.cyclist: IntArray = np.full(frames, -1, np.int64)
-        self.pedestrian: IntArray = np.full(frames, -1, np.int64)
-
-    def take(self, pair: _PairTruth, cyclist: int, pedestrian: int) -> None:
-        none_yet = self.cyclist < 0
-        # Two cyclists of one speed tie, whatever the last bit of their differences says.
-        severer = pair.severity > self.severity + _EPSILON
-        worse_danger = pair.danger & (~self.danger | severer)
-        nearer = ~pair.danger & ~self.danger & (none_yet | (pair.d_min < self.d_min - _EPSILON))
-        at = pair.considered & (worse_danger | nearer)
-        self.danger[at] = pair.danger[at]
-        self.severity[at] = pair.severity[at]
-        self.ttc[at] = pair.ttc[at]
-        self.d_min[at] = pair.d_min[at]
-        self.budget[at] = pair.budget[at]
-        self.distance[at] = pair.distance[at]
-        self.cyclist[at] = cyclist
-        self.pedestrian[at] = pedestrian
-
-
-def with_ttc_bound(settings: GroundTruthSettings, seconds: float) -> GroundTruthSettings:
-    """The same thresholds with a fixed TTC bound."""
-    if not (math.isfinite(seconds) and seconds > 0):
-        raise ValueError(f"ttc bound: expected seconds above 0, got {seconds}")
-    return replace(settings, ttc_bound_s=seconds)

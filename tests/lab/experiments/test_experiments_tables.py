@@ -132,7 +132,7 @@ def test_budgets_are_those_of_the_metrics(suite: Suite) -> None:
     for row in rows:
         i = suite.names.index(row["scenario"])
         assert row["mean"] == pytest.approx(np.mean(row["onsets"]))
-        assert row["min"] == min(row["onsets"]) == metrics.scenario_min_budget_s[i]
+        assert row["min"] == min(row["onsets"]) == metrics.by_scenario["min_warning_budget_s"][i]
 
 
 def test_cost_is_the_definition(suite: Suite) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from detection_losses import misses
 
 from bikeped.config import load_config, rule_settings
 from bikeped.errors import BikepedError
@@ -24,7 +25,7 @@ from bikeped.lab.experiments.latency import (
 from bikeped.lab.experiments.recall_curve import load_recall_curve
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.metrics import measure
-from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator
+from bikeped.lab.simulation.perception import RecallModel, trial_generator
 from bikeped.lab.simulation.simulate import (
     DetectionSequence,
     build_rule_input,

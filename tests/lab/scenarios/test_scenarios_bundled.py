@@ -144,7 +144,7 @@ def test_swerving_cyclist_shows_an_onset_at_the_closest_approach(suite, error):
 
 def test_nobody_but_the_swerving_cyclist_gets_less_than_an_attentive_walker_needs(suite):
     metrics = suite.measure(CONFIGURATIONS["selected"])
-    short = metrics.scenario_min_budget_s < 0.84
+    short = metrics.by_scenario["min_warning_budget_s"] < 0.84
     assert {n for n, s in zip(suite.names, short, strict=True) if s} == {"Swerving Cyclist"}
 
 

@@ -141,14 +141,14 @@ def test_any_sequence_against_a_plain_loop(scenarios):
     same(found.false_episodes_per_hour, total("false") / hours)
     same(found.nuisance_episodes_per_hour, total("nuisance") / hours)
     for i, e in enumerate(each):
-        same(found.scenario_sensitivity[i], ratio(e["tp"], e["tp"] + e["fn"]))
-        same(found.scenario_specificity[i], ratio(e["tn"], e["tn"] + e["fp"]))
-        same(found.scenario_sev_fn[i], e["sev_fn"])
-        same(found.scenario_fatigue[i], e["fatigue"])
-        same(found.scenario_alert_latency_s[i], e["latency"])
-        same(found.scenario_mean_budget_s[i], means[i])
-        same(found.scenario_min_budget_s[i], min(e["budgets"], default=NAN))
-        same(found.scenario_first_onset_lead_s[i], e["lead"])
+        same(found.by_scenario["sensitivity"][i], ratio(e["tp"], e["tp"] + e["fn"]))
+        same(found.by_scenario["specificity"][i], ratio(e["tn"], e["tn"] + e["fp"]))
+        same(found.by_scenario["sev_fn"][i], e["sev_fn"])
+        same(found.by_scenario["fatigue"][i], e["fatigue"])
+        same(found.by_scenario["alert_latency_s"][i], e["latency"])
+        same(found.by_scenario["mean_warning_budget_s"][i], means[i])
+        same(found.by_scenario["min_warning_budget_s"][i], min(e["budgets"], default=NAN))
+        same(found.by_scenario["first_onset_lead_s"][i], e["lead"])
 
 
 def trace(states, danger, ttc=INF, severity=0.25, budget=3.0, nearest=4.0):
@@ -165,7 +165,7 @@ def test_counts_of_a_trace_made_by_hand():
     assert found.specificity == pytest.approx(11 / 15)
     assert found.sev_fn == pytest.approx(0.4)  # the second scenario has no actionable frame
     assert found.fatigue == pytest.approx((0.5 + 0.2) / 2)
-    assert found.scenario_alert_latency_s[0] == pytest.approx(2 / 30)
+    assert found.by_scenario["alert_latency_s"][0] == pytest.approx(2 / 30)
     assert found.mean_alert_latency_s == pytest.approx(2 / 30)
 
 
@@ -193,7 +193,7 @@ def test_episodes_end_with_their_scenario():
 def test_first_onset_lead_counts_to_the_closest_approach():
     frames = trace("..AA......", "..........")
     frames = [(*f[:4], abs(i - 8) + 1.0, *f[5:]) for i, f in enumerate(frames)]
-    assert measured([frames]).scenario_first_onset_lead_s[0] == pytest.approx(6 / 30)
+    assert measured([frames]).by_scenario["first_onset_lead_s"][0] == pytest.approx(6 / 30)
 
 
 def test_contact_sensitivity_asks_only_where_a_contact_lies_ahead():
@@ -204,16 +204,16 @@ def test_contact_sensitivity_asks_only_where_a_contact_lies_ahead():
 
 def test_an_onset_without_a_finite_budget_counts_for_nothing():
     found = measured([trace("A.A.", "DDDD", budget=INF), trace("A.", "DD", budget=1.87)])
-    assert math.isnan(found.scenario_mean_budget_s[0])
+    assert math.isnan(found.by_scenario["mean_warning_budget_s"][0])
     assert found.mean_warning_budget_s == pytest.approx(1.87)
     assert found.adequate_share == 0.0  # adequate exceeds 1.87 s
 
 
 def test_a_scenario_that_never_alerts_counts_five_seconds():
     found = measured([trace("....", ".DD.")])
-    assert found.scenario_alert_latency_s[0] == INF
+    assert found.by_scenario["alert_latency_s"][0] == INF
     assert found.mean_alert_latency_s == 5.0
-    assert math.isnan(found.scenario_first_onset_lead_s[0])
+    assert math.isnan(found.by_scenario["first_onset_lead_s"][0])
 
 
 def test_json_has_null_where_there_is_no_figure():

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from detection_losses import misses
 
 from bikeped.config import rule_settings
 from bikeped.decision import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
-from bikeped.lab.simulation.perception import RecallModel, misses, trial_generator
+from bikeped.lab.simulation.perception import RecallModel, trial_generator
 from bikeped.lab.simulation.simulate import (
     FPS,
     SIMULATION_TRACKER,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario, bundled_folder, load_scenarios
-from bikeped.lab.simulation.truth import GroundTruthSettings, compute_ground_truth, with_ttc_bound
+from bikeped.lab.simulation.truth import GroundTruthSettings, compute_ground_truth
 
 INF = math.inf
 BUNDLED = {s.name: s for s in load_scenarios(bundled_folder())}
@@ -162,8 +162,8 @@ def test_every_frame_and_field_of_the_24(name):
         GroundTruthSettings(cpa_radius_m=3.0),
         GroundTruthSettings(cpa_radius_m=7.0, stopping_margin=1.0),
         GroundTruthSettings(stopping_margin=0.6),
-        with_ttc_bound(GroundTruthSettings(), 2.0),
-        with_ttc_bound(GroundTruthSettings(), 4.0),
+        GroundTruthSettings(ttc_bound_s=2.0),
+        GroundTruthSettings(ttc_bound_s=4.0),
         GroundTruthSettings(braking="aashto"),
         GroundTruthSettings(braking="ebike"),
     ],
@@ -242,9 +242,3 @@ def test_no_pair_no_danger():
     agree(
         scene(agent(1, "car", [0, 0, 0], [2, 1, 0]), agent(2, "pedestrian", [0, 1, 0], [2, 2, 0]))
     )
-
-
-@pytest.mark.parametrize("seconds", [0, -1, math.inf, math.nan])
-def test_a_ttc_bound_is_seconds(seconds):
-    with pytest.raises(ValueError, match="ttc bound"):
-        with_ttc_bound(GroundTruthSettings(), seconds)
