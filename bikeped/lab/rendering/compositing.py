@@ -42,15 +42,9 @@ def paste_sprite(image: ImageArray, street: Backdrop, sprite: Sprite) -> None:
     part[:] = cv2.addWeighted(kept, 1.0, colour, gain, 0)
 
 
-def darken(
-    image: ImageArray,
-    size: tuple[int, int],
-    left: int,
-    top: int,
-    cover: Float32Array,
-    keep: FloatArray,
-) -> None:
-    """Multiplies the picture by `keep` [3] where `cover` [h, w] is 1."""
+def darken(image: ImageArray, left: int, top: int, cover: Float32Array, keep: FloatArray) -> None:
+    """Multiplies the picture by `keep` [3] where `cover` [h, w] at (`left`, `top`) is 1."""
+    size = image.shape[1], image.shape[0]
     spot = overlapping_slices(size, left, top, cover.shape[1], cover.shape[0])
     if spot is None:
         return

@@ -87,16 +87,16 @@ class MeshBuilder:
         radii: npt.ArrayLike,
         colour: npt.ArrayLike,
         *,
-        across: Point = (0.0, 1.0, 0.0),
         layer: int = 0,
         sides: int | None = None,
     ) -> None:
-        """A skin over ellipses about `centres` [r, 3], each `radii` [r, 2] wide (`across`, and the
-        other way) and across the way to the next; `colour` [3] or one a band [r - 1, 3]."""
+        """A skin over ellipses about `centres` [r, 3] and normal to the line from the first to the
+        last, with half axes `radii` [r, 2] (left, and the other one); `colour` [3] or one a band
+        [r - 1, 3]."""
         c, r = np.asarray(centres, np.float64), np.asarray(radii, np.float64)
         sides = sides or self.sides + 2
         way = c[-1] - c[0]
-        u = np.asarray(across, np.float64)
+        u = np.array([0.0, 1.0, 0.0])
         v = cross_product(way / max(math.sqrt(float(way @ way)), 1e-9), u)
         turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
         ring = c[:, None] + r[:, :1, None] * np.cos(turn)[:, None] * u
@@ -112,20 +112,10 @@ class MeshBuilder:
         centres = np.zeros((rings, 3))
         centres[:, 2] = up * radii[2]
         centres += at
-        # Across is left; the other way, up x left, is backward: the sign does not matter to it.
         across = np.stack([wide * radii[1], wide * radii[0]], axis=1)
         self.loft(centres, across, colour, layer=layer)
 
-    def box(
-        self,
-        low: Point,
-        high: Point,
-        colour: Rgb,
-        *,
-        layer: int = 0,
-        pieces: int = 1,
-        glow: float = 0.0,
-    ) -> None:
+    def box(self, low: Point, high: Point, colour: Rgb, pieces: int = 1) -> None:
         """A box between two corners, its sides cut `pieces` times along x."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         xs = np.linspace(x0, x1, pieces + 1)
@@ -141,7 +131,7 @@ class MeshBuilder:
             [(x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1)],
             [(x0, y1, z0), (x0, y0, z0), (x0, y0, z1), (x0, y1, z1)],
         ]
-        self.faces(quads, colour, glow, layer)
+        self.faces(quads, colour)
 
     def wheel(
         self,
@@ -152,7 +142,6 @@ class MeshBuilder:
         *,
         spokes: int = 0,
         turned: float = 0.0,
-        spoke_colour: Rgb = (150, 152, 156),
         steps: int = 22,
     ) -> None:
         """A tyre standing along x about `hub`, with spokes; radius to the outside, tube half."""
@@ -173,7 +162,7 @@ class MeshBuilder:
             one, other = np.array(hub) - spoke, np.array(hub) + spoke
             half = np.array([-0.006 * math.sin(a), 0, 0.006 * math.cos(a)])
             ribbon = np.array([one - half, other - half, other + half, one + half])
-            self.faces(np.stack([ribbon, ribbon[::-1]]), spoke_colour)
+            self.faces(np.stack([ribbon, ribbon[::-1]]), (150, 152, 156))
 
     def disc(
         self, hub: Point, radius: float, left: float, colour: Rgb, layer: int = 1, steps: int = 16

@@ -199,12 +199,12 @@ class ScenePainter:
             softness = 1 if self.camera.size[0] < 1200 else 2
             cast = shadow(mesh.quads, self.camera, light.to_sun, softness)
             if cast is not None:
-                darken(image, self.camera.size, *cast, light.shade)
+                darken(image, *cast, light.shade)
                 left, top, cover = cast
                 box = (left, top, left + cover.shape[1], top + cover.shape[0])
         patch = contact_shadow(self.camera, xy, size_m, heading)
         if patch is not None:
-            darken(image, self.camera.size, *patch, np.array([0.6, 0.6, 0.62]))
+            darken(image, *patch, np.array([0.6, 0.6, 0.62]))
         return box
 
     def _labels(self, shown: list[_SceneItem]) -> list[DrawnObject]:

@@ -132,28 +132,19 @@ def walker(
         centres = [((x + lean * (z - 0.9)) * s, 0.0, (z + up) * s) for x, z, _, _ in rows]
         return centres, [[w * g * s, d * g * s] for _, _, w, d in rows]
 
-    b.loft(
-        *spine((0, 0.82, 0.10, 0.08), (0, 0.88, 0.165, 0.115), (0, 1.0, 0.155, 0.105)),
-        style.legs if style.wear != "coat" else style.top,
-    )
-    b.loft(
-        *spine(
-            (0, 0.94, 0.155, 0.108),
-            (0, 1.06, 0.145, 0.102),
-            (0.01, 1.25, 0.172, 0.12),
-            (0, 1.36, 0.178, 0.105),
-            (-0.005, 1.425, 0.13, 0.085),
-            (0, 1.46, 0.05, 0.05),
-        ),
-        style.top,
-    )
+    hips = (0, 0.82, 0.10, 0.08), (0, 0.88, 0.165, 0.115), (0, 1.0, 0.155, 0.105)
+    b.loft(*spine(*hips), style.legs if style.wear != "coat" else style.top)
+    chest = (
+        (0, 0.94, 0.155, 0.108), (0, 1.06, 0.145, 0.102), (0.01, 1.25, 0.172, 0.12),
+        (0, 1.36, 0.178, 0.105), (-0.005, 1.425, 0.13, 0.085), (0, 1.46, 0.05, 0.05),
+    )  # fmt: skip
+    b.loft(*spine(*chest), style.top)
     if style.wear in {"skirt", "coat"}:
         hem = 0.55 if style.wear == "skirt" else 0.62
         cloth = style.legs if style.wear == "skirt" else style.top
         flare = 0.05 * abs(math.sin(phase)) if moving else 0.0
-        b.loft(
-            *spine((0, hem, 0.2, 0.16 + flare), (0, 0.8, 0.18, 0.14), (0, 1.0, 0.15, 0.105)), cloth
-        )
+        cone = (0, hem, 0.2, 0.16 + flare), (0, 0.8, 0.18, 0.14), (0, 1.0, 0.15, 0.105)
+        b.loft(*spine(*cone), cloth)
     for side, thigh, *_ in legs:
         arm = -1.05 * thigh
         shoulder = np.array([0.0, 0.195 * side * g, 1.375])

@@ -64,14 +64,9 @@ class SceneCamera:
 
     def window(self) -> tuple[float, float, float, float]:
         """The part of the picture that the crop covers: u1, v1, u2, v2."""
-        low = self.framing.crop_to_frame(np.array(self.framing.window_px[:2]))
-        high = self.framing.crop_to_frame(np.array(self.framing.window_px[2:]))
-        return (
-            max(float(low[0]), 0.0),
-            max(float(low[1]), 0.0),
-            min(float(high[0]), float(self.size[0])),
-            min(float(high[1]), float(self.size[1])),
-        )
+        corners = np.array(self.framing.window_px).reshape(2, 2)
+        low, high = np.clip(self.framing.crop_to_frame(corners), 0, self.size).tolist()
+        return low[0], low[1], high[0], high[1]
 
 
 @dataclass(frozen=True)
@@ -100,15 +95,13 @@ def lens_camera(
     *,
     height_m: float = 3.6576,
     pitch_deg: float = 0.0,
-    heading_deg: float = 0.0,
     pose: CameraPose = DEFAULT_POSE,
 ) -> SceneCamera:
     """Any lens (its focal length in pixels of `size`) with its axis in the picture's middle."""
     width, height = size
     frame = Framing(width, height)
-    camera = GroundCamera(
-        lens, width / 2, height / 2, height_m, pitch_deg, heading_deg, frame.window_px
-    )
+    centre = width / 2, height / 2
+    camera = GroundCamera(lens, *centre, height_m, pitch_deg, window_px=frame.window_px)
     return SceneCamera(camera, frame, pose, size)
 
 
@@ -142,31 +135,22 @@ def rays(view: SceneCamera) -> Rays:
     reach = np.hypot(*np.moveaxis(crop - centre, -1, 0))
     crop = centre + (crop - centre) * np.minimum(1.0, rim / np.maximum(reach, 1e-9))[..., None]
     ground = view.camera.rays(crop)
-    world = np.concatenate(
-        [
-            view.pose.ground_to_world(ground[..., :2]) - (view.pose.x_m, view.pose.y_m),
-            ground[..., 2:],
-        ],
-        axis=-1,
-    ).astype(np.float32)
+    level = view.pose.ground_to_world(ground[..., :2]) - (view.pose.x_m, view.pose.y_m)
+    world = np.concatenate([level, ground[..., 2:]], axis=-1).astype(np.float32)
     theta = np.arccos(np.clip(world @ _axis(view), -1, 1)) / view.camera.lens.max_theta_rad
     coarse = np.dstack([world, reach.astype(np.float32), theta.astype(np.float32)])
     # Lattice nodes lie on pixel edges; a pixel's middle is half a pixel further.
     at_u = ((np.arange(width) + 0.5) / _LATTICE_PX).astype(np.float32)
     at_v = ((np.arange(height) + 0.5) / _LATTICE_PX).astype(np.float32)
     map_u, map_v = np.meshgrid(at_u, at_v)
+    parts = (np.ascontiguousarray(part) for part in (coarse[..., :3], coarse[..., 3:5]))
     fine = np.dstack(
-        [
-            np.asarray(cv2.remap(np.ascontiguousarray(part), map_u, map_v, cv2.INTER_LINEAR))
-            for part in (coarse[..., :3], coarse[..., 3:5])
-        ]
+        [np.asarray(cv2.remap(part, map_u, map_v, cv2.INTER_LINEAR)) for part in parts]
     )
     lit = fine[..., 3] < rim
     u1, v1, u2, v2 = view.window()
-    lit[: round(v1)] = False
-    lit[round(v2) :] = False
-    lit[:, : round(u1)] = False
-    lit[:, round(u2) :] = False
+    lit[: round(v1)] = lit[round(v2) :] = False
+    lit[:, : round(u1)] = lit[:, round(u2) :] = False
     edge = fine[..., 4]
     vignette = (1.0 - 0.42 * edge**3) * np.clip((1.0 - edge) * 40, 0, 1)
     if view.camera.lens.projection == "perspective":
