@@ -48,31 +48,7 @@ def draw_overlay(
     `ground_to_frame`: puts unseen tracks and the pair line where they lie; without it unseen
     tracks are left out and the pair line joins the boxes.
     """
-    image = np.ascontiguousarray(rgb).copy()
-    h, w = image.shape[:2]
-    size = _text_height(w, h)
-    top = _banner_height(w, h) if banner else 0
-    bounds: Rect = (2, top + 2, w - 2, h - 2)
-    footer = _footer_rect(data, size, bounds)
-    taken: list[Rect] = [footer]
-    labels: list[tuple[str, Rect, Rgb]] = []
-
-    boxes = data.detections.box_px.astype(np.float64) * scale
-    rows = data.pair_rows()
-    ends = _pair_points(data, rows, boxes, scale, ground_to_frame)
-    if ends is not None:
-        _draw_pair(image, ends, data.pair_colour, size)
-    _draw_unseen(image, data, scale, ground_to_frame, size, labels)
-    _draw_boxes(image, data, boxes, rows, size, labels)
-    _draw_distance(image, data, ends, taken, bounds, size)
-    shown = [label for label in labels if overlap(label[1], (0, 0, w, h)) > 0]
-    avoid = [box for _, box, _ in shown]
-    for text, box, colour in shown:
-        _draw_label(image, text, box, colour, taken, avoid, bounds, size)
-    _draw_footer(image, data, footer, size)
-    if banner:
-        draw_banner(image, data, (0, 0, w, top))
-    return image
+    return _CameraView(rgb, data, scale, ground_to_frame).draw(banner)
 
 
 def draw_banner(image: ImageArray, data: OverlayData, rect: Rect) -> None:
@@ -130,165 +106,164 @@ def _banner_height(w: int, h: int) -> int:
     return int(np.clip(round(min(h, w * 9 / 16) * 0.085), 30, 96))
 
 
-def _draw_boxes(
-    image: ImageArray,
-    data: OverlayData,
-    boxes: FloatArray,
-    rows: tuple[int, int] | None,
-    size: int,
-    labels: list[tuple[str, Rect, Rgb]],
-) -> None:
-    """Boxes, small ones over large ones; adds their labels, those of the pair first."""
-    tracks = data.tracks
-    row_of = {int(d): i for i, d in enumerate(tracks.detection) if d >= 0}
-    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    line = max(round(size / 6), 2)
-    entries: list[tuple[bool, str, Rect, Rgb]] = []
-    for d in np.argsort(-area, kind="stable").tolist():
-        x0, y0, x1, y1 = boxes[d].tolist()
-        box: Rect = (x0, y0, x1, y1)
-        row = row_of.get(d)
-        kind = Kind(int(data.detections.kind[d]))
-        colour = KIND_COLOUR[kind]
-        paired = row is not None and rows is not None and row in rows
-        if paired and data.alerting:
-            halo = line * 2 + 1
-            wide: Rect = (x0 - halo, y0 - halo, x1 + halo, y1 + halo)
-            outline(image, wide, PAPER, line + 3)
-            outline(image, wide, SIGNAL_COLOUR["ALERT"], line + 1)
-            box = wide
-        outline(image, (x0, y0, x1, y1), INK, line + 2)
-        outline(image, (x0, y0, x1, y1), colour, line)
-        if row is None:
-            text = f"{kind.label} {data.detections.confidence[d]:.2f}"
-            colour = shade(colour, 0.7)
-        else:
-            speed = float(np.hypot(*tracks.velocity_mps[row]))
-            text = f"{Kind(int(tracks.kind[row])).label} {tracks.id[row]}  {speed:.1f} m/s"
-        entries.append((paired, text, box, colour))
-    entries.reverse()
-    entries.sort(key=lambda item: not item[0])
-    labels[:0] = [(text, box, colour) for _, text, box, colour in entries]
+class _CameraView:
+    """One picture in the making; pixels are those of the drawn picture."""
 
+    def __init__(
+        self,
+        rgb: ImageArray,
+        data: OverlayData,
+        scale: float,
+        ground_to_frame: GroundToFrame | None,
+    ) -> None:
+        self.image = np.ascontiguousarray(rgb).copy()
+        self.h, self.w = self.image.shape[:2]
+        self.data, self.scale, self.ground_to_frame = data, scale, ground_to_frame
+        self.size = _text_height(self.w, self.h)
+        self.line_px = max(round(self.size / 6), 2)
+        self.boxes = data.detections.box_px.astype(np.float64) * scale
+        self.rows = data.pair_rows()
+        self.taken: list[Rect] = []  #: covered by text already
+        self.labels: list[tuple[str, Rect, Rgb]] = []
 
-def _draw_unseen(
-    image: ImageArray,
-    data: OverlayData,
-    scale: float,
-    ground_to_frame: GroundToFrame | None,
-    size: int,
-    labels: list[tuple[str, Rect, Rgb]],
-) -> None:
-    """A dashed ring on the ground at the predicted place of each track without a detection."""
-    if ground_to_frame is None:
-        return
-    tracks = data.tracks
-    turn = np.linspace(0, 2 * np.pi, 49)
-    ring = RING_M * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    near = np.hypot(tracks.xy_m[:, 0], tracks.xy_m[:, 1]) <= UNSEEN_RANGE_M
-    for row in np.flatnonzero((tracks.detection < 0) & near).tolist():
-        kind = Kind(int(tracks.kind[row]))
-        points = ground_to_frame(tracks.xy_m[row] + ring) * scale
-        if not np.isfinite(points).any():
-            continue
-        line = max(round(size / 6), 2)
-        # Eight dashes a turn, but never shorter than a dot.
-        dash = max(size * 0.3, float(np.nansum(np.hypot(*np.diff(points, axis=0).T))) / 16)
-        polyline(image, points, INK, 1)
-        dashed(image, points, INK, line + 2, dash)
-        dashed(image, points, KIND_COLOUR[kind], line, dash)
-        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-        text = f"{kind.label} {tracks.id[row]}  unseen {tracks.unseen_s[row]:.1f} s"
-        rect: Rect = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        labels.append((text, rect, shade(KIND_COLOUR[kind], 0.75)))
+    def draw(self, banner: bool) -> ImageArray:
+        """The finished picture."""
+        w, h = self.w, self.h
+        top = _banner_height(w, h) if banner else 0
+        self.bounds: Rect = (2, top + 2, w - 2, h - 2)
+        footer = self._footer()
+        line = self._pair_line()
+        if line is not None:
+            wide = max(round(self.size / 5), 2)
+            polyline(self.image, line, INK, wide + 3)
+            polyline(self.image, line, self.data.pair_colour, wide)
+        self._draw_unseen()
+        self._draw_boxes()
+        self._draw_distance(line)
+        shown = [label for label in self.labels if overlap(label[1], (0, 0, w, h)) > 0]
+        avoid = [box for _, box, _ in shown]
+        for text, box, colour in shown:
+            self._draw_label(text, box, colour, avoid)
+        footer_text, rect = footer
+        fill_rect(self.image, rect, INK, 0.72)
+        draw_text(self.image, footer_text, (self.size, rect[1] + 0.6 * self.size), self.size, PAPER)
+        if banner:
+            draw_banner(self.image, self.data, (0, 0, w, top))
+        return self.image
 
+    def _draw_boxes(self) -> None:
+        """Boxes, small ones over large ones; adds their self.labels, those of the pair first."""
+        tracks = self.data.tracks
+        row_of = {int(d): i for i, d in enumerate(tracks.detection) if d >= 0}
+        area = (self.boxes[:, 2] - self.boxes[:, 0]) * (self.boxes[:, 3] - self.boxes[:, 1])
+        line = self.line_px
+        entries: list[tuple[bool, str, Rect, Rgb]] = []
+        for d in np.argsort(-area, kind="stable").tolist():
+            x0, y0, x1, y1 = self.boxes[d].tolist()
+            box: Rect = (x0, y0, x1, y1)
+            row = row_of.get(d)
+            kind = Kind(int(self.data.detections.kind[d]))
+            colour = KIND_COLOUR[kind]
+            paired = row is not None and self.rows is not None and row in self.rows
+            if paired and self.data.alerting:
+                halo = line * 2 + 1
+                wide: Rect = (x0 - halo, y0 - halo, x1 + halo, y1 + halo)
+                outline(self.image, wide, PAPER, line + 3)
+                outline(self.image, wide, SIGNAL_COLOUR["ALERT"], line + 1)
+                box = wide
+            outline(self.image, (x0, y0, x1, y1), INK, line + 2)
+            outline(self.image, (x0, y0, x1, y1), colour, line)
+            if row is None:
+                text = f"{kind.label} {self.data.detections.confidence[d]:.2f}"
+                colour = shade(colour, 0.7)
+            else:
+                speed = float(np.hypot(*tracks.velocity_mps[row]))
+                text = f"{Kind(int(tracks.kind[row])).label} {tracks.id[row]}  {speed:.1f} m/s"
+            entries.append((paired, text, box, colour))
+        entries.reverse()
+        entries.sort(key=lambda item: not item[0])
+        self.labels[:0] = [(text, box, colour) for _, text, box, colour in entries]
 
-def _pair_points(
-    data: OverlayData,
-    rows: tuple[int, int] | None,
-    boxes: FloatArray,
-    scale: float,
-    ground_to_frame: GroundToFrame | None,
-) -> FloatArray | None:
-    """The pair line in pixels [n, 2]: straight on the ground, hence bent in a fisheye picture."""
-    if rows is None:
-        return None
-    tracks = data.tracks
-    if ground_to_frame is not None:
-        share = np.linspace(0, 1, 25)[:, None]
-        xy_m = tracks.xy_m[rows[0]] * (1 - share) + tracks.xy_m[rows[1]] * share
-        line = ground_to_frame(xy_m) * scale
-        return line if np.isfinite(line).all(axis=1).sum() > 1 else None
-    detection = tracks.detection[list(rows)]
-    if (detection < 0).any():
-        return None
-    pair = boxes[detection]
-    return np.stack([(pair[:, 0] + pair[:, 2]) / 2, pair[:, 3]], axis=1)
+    def _draw_unseen(self) -> None:
+        """A dashed ring on the ground at the predicted place of each track without a detection."""
+        if self.ground_to_frame is None:
+            return
+        tracks = self.data.tracks
+        turn = np.linspace(0, 2 * np.pi, 49)
+        ring = RING_M * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        near = np.hypot(tracks.xy_m[:, 0], tracks.xy_m[:, 1]) <= UNSEEN_RANGE_M
+        for row in np.flatnonzero((tracks.detection < 0) & near).tolist():
+            kind = Kind(int(tracks.kind[row]))
+            points = self.ground_to_frame(tracks.xy_m[row] + ring) * self.scale
+            if not np.isfinite(points).any():
+                continue
+            line = self.line_px
+            # Eight dashes a turn, but never shorter than a dot.
+            dash = max(self.size * 0.3, float(np.nansum(np.hypot(*np.diff(points, axis=0).T))) / 16)
+            polyline(self.image, points, INK, 1)
+            dashed(self.image, points, INK, line + 2, dash)
+            dashed(self.image, points, KIND_COLOUR[kind], line, dash)
+            low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+            text = f"{kind.label} {tracks.id[row]}  unseen {tracks.unseen_s[row]:.1f} s"
+            rect: Rect = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+            self.labels.append((text, rect, shade(KIND_COLOUR[kind], 0.75)))
 
+    def _pair_line(self) -> FloatArray | None:
+        """The pair line in pixels [n, 2]: straight on the ground, so bent in a fisheye picture."""
+        if self.rows is None:
+            return None
+        tracks = self.data.tracks
+        if self.ground_to_frame is not None:
+            share = np.linspace(0, 1, 25)[:, None]
+            xy_m = tracks.xy_m[self.rows[0]] * (1 - share) + tracks.xy_m[self.rows[1]] * share
+            line = self.ground_to_frame(xy_m) * self.scale
+            return line if np.isfinite(line).all(axis=1).sum() > 1 else None
+        detection = tracks.detection[list(self.rows)]
+        if (detection < 0).any():
+            return None
+        pair = self.boxes[detection]
+        return np.stack([(pair[:, 0] + pair[:, 2]) / 2, pair[:, 3]], axis=1)
 
-def _draw_pair(image: ImageArray, line: FloatArray, colour: Rgb, size: int) -> None:
-    wide = max(round(size / 5), 2)
-    polyline(image, line, INK, wide + 3)
-    polyline(image, line, colour, wide)
+    def _draw_distance(self, line: FloatArray | None) -> None:
+        """The pair's distance at the middle of its line."""
+        pair = self.data.decision.pair
+        if line is None or pair is None:
+            return
+        shown = line[np.isfinite(line).all(axis=1)]
+        inside = (shown >= self.bounds[:2]).all(axis=1) & (shown <= self.bounds[2:]).all(axis=1)
+        if not inside.any():
+            return
+        u, v = shown[inside][int(inside.sum()) // 2]
+        height = self.size + 1
+        text = f"{pair.distance_m:.1f} m"
+        half = (text_size(text, height, True)[0] + height) / 2 + 1
+        fill_rect(self.image, (u - half, v - height - 1, u + half, v + height + 1), INK)
+        self.taken.append(draw_tag(self.image, text, (u, v), height, self.data.pair_colour))
 
+    def _draw_label(self, text: str, box: Rect, colour: Rgb, avoid: list[Rect]) -> None:
+        w, h = text_size(text, self.size)[0] + self.size, round(self.size * 1.9)
+        spot = place_label((w, h), box, self.taken, self.bounds, avoid=avoid)
+        self.taken.append(spot)
+        fill_rect(self.image, (spot[0] - 1, spot[1] - 1, spot[2] + 1, spot[3] + 1), INK)
+        fill_rect(self.image, spot, colour)
+        draw_text(
+            self.image,
+            text,
+            (spot[0] + self.size / 2, spot[1] + (h - self.size) / 2),
+            self.size,
+            readable_on(colour),
+        )
 
-def _draw_distance(
-    image: ImageArray,
-    data: OverlayData,
-    line: FloatArray | None,
-    taken: list[Rect],
-    bounds: Rect,
-    size: int,
-) -> None:
-    """The pair's distance at the middle of its line."""
-    pair = data.decision.pair
-    if line is None or pair is None:
-        return
-    shown = line[np.isfinite(line).all(axis=1)]
-    inside = (shown >= bounds[:2]).all(axis=1) & (shown <= bounds[2:]).all(axis=1)
-    if not inside.any():
-        return
-    u, v = shown[inside][int(inside.sum()) // 2]
-    height = size + 1
-    text = f"{pair.distance_m:.1f} m"
-    half = (text_size(text, height, True)[0] + height) / 2 + 1
-    fill_rect(image, (u - half, v - height - 1, u + half, v + height + 1), INK)
-    taken.append(draw_tag(image, text, (u, v), height, data.pair_colour))
-
-
-def _draw_label(
-    image: ImageArray,
-    text: str,
-    box: Rect,
-    colour: Rgb,
-    taken: list[Rect],
-    avoid: list[Rect],
-    bounds: Rect,
-    size: int,
-) -> None:
-    w, h = text_size(text, size)[0] + size, round(size * 1.9)
-    spot = place_label((w, h), box, taken, bounds, avoid=avoid)
-    taken.append(spot)
-    fill_rect(image, (spot[0] - 1, spot[1] - 1, spot[2] + 1, spot[3] + 1), INK)
-    fill_rect(image, spot, colour)
-    draw_text(
-        image, text, (spot[0] + size / 2, spot[1] + (h - size) / 2), size, readable_on(colour)
-    )
-
-
-def _footer_text(data: OverlayData) -> str:
-    parts = [data.clock] if data.clock else []
-    parts += [f"{data.time_s:.2f} s", f"frame {data.frame_number}"]
-    if data.latency_s is not None:
-        parts.append(f"latency {data.latency_s * 1000:.0f} ms")
-    return "   ".join(parts)
-
-
-def _footer_rect(data: OverlayData, size: int, bounds: Rect) -> Rect:
-    width = text_size(_footer_text(data), size)[0] + 2 * size
-    return (0, bounds[3] + 2 - 2.2 * size, float(width), bounds[3] + 2)
-
-
-def _draw_footer(image: ImageArray, data: OverlayData, rect: Rect, size: int) -> None:
-    fill_rect(image, rect, INK, 0.72)
-    draw_text(image, _footer_text(data), (size, rect[1] + 0.6 * size), size, PAPER)
+    def _footer(self) -> tuple[str, Rect]:
+        """The footer's text and its place at the lower left edge, which is taken."""
+        data = self.data
+        parts = [data.clock] if data.clock else []
+        parts += [f"{data.time_s:.2f} s", f"frame {data.frame_number}"]
+        if data.latency_s is not None:
+            parts.append(f"latency {data.latency_s * 1000:.0f} ms")
+        text = "   ".join(parts)
+        width = text_size(text, self.size)[0] + 2 * self.size
+        bottom = self.bounds[3] + 2
+        rect: Rect = (0, bottom - 2.2 * self.size, float(width), bottom)
+        self.taken.append(rect)
+        return text, rect
