@@ -114,12 +114,12 @@ class FfmpegReader:
         ]
         self._open_capture = open_capture
         self._capture = self._open()
-        self._raw = self._request_raw()
+        self.raw = self._request_raw()  #: whether images come as JPEG
         first = self._read()
-        if self._raw and not self._whole_jpeg(first):
+        if self.raw and not self._whole_jpeg(first):
             self._capture.release()
             self._capture = self._open()
-            self._raw = False
+            self.raw = False
             first = self._read()
         if first is None:
             self._capture.release()
@@ -128,11 +128,6 @@ class FfmpegReader:
         self.fps = self._capture.get(cv2.CAP_PROP_FPS)
         self.expected_frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.width, self.height = self._size(first)
-
-    @property
-    def raw(self) -> bool:
-        """Whether images come as JPEG."""
-        return self._raw
 
     def read(self) -> RawImage | None:
         """The next image, or None at the end of a file or stream."""
@@ -195,6 +190,6 @@ class FfmpegReader:
         if not ok or data is None:
             return None
         media_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-        if self._raw:
+        if self.raw:
             return RawImage(data.tobytes(), None, media_s)
         return RawImage(None, as_rgb(data), media_s)

@@ -91,16 +91,16 @@ class NetworkDetector:
         self._backend = backend
         self._config = config
         self._source = str(path)
-        self._hash = model_hash
+        self.model_hash = model_hash
         height, width = backend.buffer.shape[2:]
-        self._size = (int(width), int(height))
+        self.input_size = (int(width), int(height))
         metadata = backend.metadata
         backend.buffer[...] = PAD if backend.buffer.dtype == np.uint8 else PAD / 255
         outputs = backend.run()
         self._output = pick_output(outputs, self._source)
         answer = outputs[self._output][1]
-        choice = choose_layout(answer, self._size, metadata, config.layout, self._source)
-        self._layout: Layout = choice.layout
+        choice = choose_layout(answer, self.input_size, metadata, config.layout, self._source)
+        self.layout: Layout = choice.layout
         classes = choice.classes
         if choice.layout == "end2end" and classes is None:
             classes = _coco_if_plausible(answer)
@@ -108,13 +108,14 @@ class NetworkDetector:
         self.class_names: tuple[str, ...] = names  #: of the network's own classes, by their number
         self._kind_of_class = kind_table(names, config, self._source)
         self._wanted = self._kind_of_class != UNMAPPED
-        self._includes_rider = cyclist_classes_include_riders(names, self._kind_of_class)
-        self._rider_overlap = 1.0 if self._includes_rider else config.rider_overlap
+        self.cyclist_box_includes_rider = cyclist_classes_include_riders(names, self._kind_of_class)
+        self._rider_overlap = 1.0 if self.cyclist_box_includes_rider else config.rider_overlap
         share = RIDDEN_CONFIDENCE_SHARE if self._rider_overlap < 1 else 1.0
         self._min_confidence = np.where(
             self._kind_of_class == Kind.CYCLIST, config.confidence * share, config.confidence
         ).astype(np.float32)
         family, why = _family(choice.layout, metadata, config, path)
+        self.family: Family = family
         self._preprocess = Preprocessor(family, backend.buffer, region)
         log.info(
             "%s: %s, input %d x %d, region %s, layout %s (%s), preprocessing %s (%s), %d classes",
@@ -130,37 +131,14 @@ class NetworkDetector:
             len(names),
         )
         # Once more through every stage, for grid tables, canvases and the runtime's caches.
-        self.infer(np.full((height, width, 3), PAD, np.uint8), self._size[0], self._size[1])
+        self.infer(
+            np.full((height, width, 3), PAD, np.uint8), self.input_size[0], self.input_size[1]
+        )
 
     @property
     def name(self) -> str:
         """The model file and what runs it."""
         return f"{Path(self._source).name} ({self._backend.description})"
-
-    @property
-    def model_hash(self) -> str:
-        """SHA-256 of the model file."""
-        return self._hash
-
-    @property
-    def input_size(self) -> tuple[int, int]:
-        """Width and height of the network's input."""
-        return self._size
-
-    @property
-    def cyclist_box_includes_rider(self) -> bool:
-        """Whether a cyclist's box holds the rider, too, by the names of the model's classes."""
-        return self._includes_rider
-
-    @property
-    def layout(self) -> Layout:
-        """The output layout in use."""
-        return self._layout
-
-    @property
-    def family(self) -> Family:
-        """The preprocessing in use."""
-        return self._preprocess.family
 
     def decode_size(self, frame_width: int, frame_height: int) -> tuple[int, int]:
         """The size of the whole frame at the scale of the network's input, at most its own size."""
@@ -195,7 +173,12 @@ class NetworkDetector:
         output = self._run()
         users = self._decode_road_users(output)
         every = decode(
-            output, self._layout, self._size, confidence, np.ones_like(self._wanted), self._source
+            output,
+            self.layout,
+            self.input_size,
+            confidence,
+            np.ones_like(self._wanted),
+            self._source,
         )
         box = _to_frame(every.box, letterbox)
         kept = _has_area(box)
@@ -210,7 +193,7 @@ class NetworkDetector:
 
     def _decode_road_users(self, output: npt.NDArray[Any]) -> Candidates:
         return decode(
-            output, self._layout, self._size, self._min_confidence, self._wanted, self._source
+            output, self.layout, self.input_size, self._min_confidence, self._wanted, self._source
         )
 
     def _road_users(self, candidates: Candidates, letterbox: Letterbox) -> Detections:
@@ -243,7 +226,9 @@ class NetworkDetector:
         Where a cyclist's box includes the rider, pedestrians and cyclists suppress one another.
         """
         group = (
-            np.where(kind == Kind.CYCLIST, Kind.PEDESTRIAN, kind) if self._includes_rider else kind
+            np.where(kind == Kind.CYCLIST, Kind.PEDESTRIAN, kind)
+            if self.cyclist_box_includes_rider
+            else kind
         )
         return non_max_suppression(box, score, group, self._config.iou, self._config.max_detections)
 

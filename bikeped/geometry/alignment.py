@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -43,14 +43,9 @@ class Alignment:
     @staticmethod
     def of(camera: GroundCamera) -> Alignment:
         """The parameters of `camera`."""
-        return Alignment(
-            height_m=camera.height_m,
-            pitch_deg=camera.pitch_deg,
-            radius_px=plain_radius_px(camera.lens),
-            cx=camera.cx,
-            cy=camera.cy,
-            heading_deg=camera.heading_deg,
-        )
+        c = camera
+        radius_px = plain_radius_px(c.lens)
+        return Alignment(c.height_m, c.pitch_deg, radius_px, c.cx, c.cy, c.heading_deg)
 
     def camera(self, like: GroundCamera) -> GroundCamera:
         """`like` with these parameters; GeometryError where they give no camera."""
@@ -60,15 +55,9 @@ class Alignment:
         lens = like.lens
         if self.radius_px != old_px:
             lens = replace(lens, focal_px=lens.focal_px * self.radius_px / old_px)
-        return replace(
-            like,
-            lens=lens,
-            cx=self.cx,
-            cy=self.cy,
-            height_m=self.height_m,
-            pitch_deg=self.pitch_deg,
-            heading_deg=self.heading_deg,
-        )
+        own = asdict(self)
+        del own["radius_px"]
+        return replace(like, lens=lens, **own)
 
     def scale(self, name: str) -> float:
         """A small step of a parameter: 0.1 m, 1 degree, or 1 % of the radius."""
