@@ -1,7 +1,7 @@
 """What all figures share: sheets with title and caption, colours, labels, bars, saving.
 
-Colours are Okabe and Ito's, told apart with every common colour blindness; beside them every
-series has its own marker, dash or hatch, so that a grey print reads the same.
+Colours are Okabe and Ito's, distinct under every common colour blindness; each series also has a
+marker, dash or hatch of its own, so that a grey print reads the same.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class FigureSheet:
         self.figure.text(
             left,
             1 - _MARGIN_IN / total,
-            # Names of scenarios are anybody's: a dollar sign is not mathematics.
+            # A dollar sign in the name of a scenario is not mathematics.
             escape_dollars("\n".join(title_lines)),
             fontsize=_TITLE_PT,
             fontweight="bold",

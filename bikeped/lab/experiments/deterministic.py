@@ -238,7 +238,7 @@ def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> ExperimentResul
 
 
 def braking_profiles(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
-    """The same decisions when every cyclist brakes as one profile says, in truth only."""
+    """The same decisions against ground truth in which all cyclists brake by one profile."""
     states = suite.states(decision)
     profiles = {"scenario": None, "bicycle": "bicycle", "ebike": "ebike", "aashto": "aashto"}
     rows: list[dict[str, Any]] = []
@@ -250,7 +250,7 @@ def braking_profiles(suite: Suite, decision: DecisionConfig) -> ExperimentResult
         "Braking profiles of the ground truth",
         ("profile", *METRIC_COLUMNS),
         [(row["profile"], *cells(row["metrics"], METRIC_COLUMNS)) for row in rows],
-        "scenario: bicycle or e-bike, as each scenario says",
+        "scenario: bicycle or e-bike, as each scenario has it",
     )
     return ExperimentResult("braking", {"rows": rows}, (table,))
 

@@ -149,7 +149,7 @@ def placement(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
 def braking(data: Data, title: str, caption: str, folder: Path) -> list[Path]:
     """Figures under each braking profile of the ground truth."""
     words = {
-        "scenario": "as each scenario says",
+        "scenario": "as each scenario has it",
         "bicycle": "bicycle: 0.84 s, 1.96 m/s²",
         "ebike": "e-bike: 0.84 s, 6.0 m/s²",
         "aashto": "AASHTO: 2.5 s, 3.4 m/s²",

@@ -152,11 +152,11 @@ def _path(axes: Axes, agent: Agent, box: tuple[float, float, float, float], ever
 
 
 def _arrows(axes: Axes, agent: Agent, colour: str, box: tuple[float, float, float, float]) -> None:
-    """Arrowheads at a fifth, the middle and the end of the part of a path that is shown."""
+    """Arrowheads at a fifth, the middle and the end of the visible part of a path."""
     times = np.linspace(agent.start_s, agent.end_s, 200)
     xy, heading, _ = agent.sample(np.asarray(times, np.float64))
-    shown = (xy[:, 0] > box[0]) & (xy[:, 0] < box[1]) & (xy[:, 1] > box[2]) & (xy[:, 1] < box[3])
-    index = np.nonzero(shown)[0]
+    visible = (xy[:, 0] > box[0]) & (xy[:, 0] < box[1]) & (xy[:, 1] > box[2]) & (xy[:, 1] < box[3])
+    index = np.nonzero(visible)[0]
     if not len(index) or np.hypot(*np.ptp(xy[index], axis=0)) < 0.5:
         return
     arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 13}

@@ -1,4 +1,4 @@
-"""Audit records of a simulated run: what was true, what was seen, what was decided, every frame.
+"""Audit records of a simulated run: true and observed positions, tracks, decision of each frame.
 
 JSON Lines: for each scenario one `header`, then one `frame` after the other (paper, section 4:
 post-hoc review of any individual alert or missed detection). Positions are in the camera ground
@@ -34,7 +34,7 @@ def write_audit(
 ) -> None:
     """Writes the audit of a run without loss; the file appears whole or not at all.
 
-    `seed` is recorded: what draws no random numbers gives the same file under every seed.
+    `seed` is recorded only: nothing here is random.
     """
     try:
         with WholeFile(path) as partial, partial.open("w", encoding="utf-8") as file:
@@ -66,8 +66,8 @@ def audit_records(
         "camera": camera_json(suite),
         "decision": msgspec.to_builtins(decision),
     }
-    for lane, scenario in enumerate(suite.scenarios):
-        frames = run.frame_slice(lane)
+    for index, scenario in enumerate(suite.scenarios):
+        frames = run.frame_slice(index)
         yield {
             "type": "header",
             "scenario": scenario.name,
@@ -78,7 +78,7 @@ def audit_records(
             "agents": [{"id": a.id, "kind": a.kind} for a in scenario.agents],
             **common,
         }
-        truth, seen = suite.truths[lane], suite.perception_results[lane]
+        truth, seen = suite.truths[index], suite.perception_results[index]
         error = seen.error_m
         for i, frame in enumerate(range(frames.start, frames.stop)):
             known = truth.cyclist[i] >= 0
@@ -118,7 +118,7 @@ def audit_records(
 
 
 def _first_fired(run: RuleInput, decision: DecisionConfig) -> dict[int, dict[str, Any]]:
-    """By frame: the first pair in track order that fired, as the pole would name it, and why."""
+    """By frame: the first pair in track order that fired, as on the pole, and its distances."""
     found = verdicts(run, rule_settings(decision))
     pairs, rows = run.pairs, run.rows
     out: dict[int, dict[str, Any]] = {}

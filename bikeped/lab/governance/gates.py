@@ -1,7 +1,7 @@
 """The deployment gates (definitions, section 10; paper, section 4).
 
-Provisional design targets, as the paper says: they tell a configuration that fails by design from
-one that does not, and say nothing of rain, darkness or real people.
+Provisional design targets, as the paper says: they reject configurations that fail by design, and
+say nothing about rain, darkness or real people.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ class Gate:
     strict: bool = False
 
     def format_value(self, value: float) -> str:
-        """A figure of this gate in its unit; one that fails never reads like one that holds.
+        """A value in the gate's unit; one that fails never reads like one that holds.
 
         89.96 % must not read 90.0 % beside a gate of 90 %.
         """
         if not math.isfinite(value):
             return "nothing to measure"
         scale, digits = (100.0, 1) if self.unit == "%" else (1.0, 2)
-        shown = round(value * scale, digits)
-        while value < self.required and shown >= round(self.required * scale, digits):
+        rounded = round(value * scale, digits)
+        while value < self.required and rounded >= round(self.required * scale, digits):
             digits += 1
-            shown = math.floor(value * scale * 10**digits) / 10**digits
-        return f"{shown:.{digits}f} {self.unit}"
+            rounded = math.floor(value * scale * 10**digits) / 10**digits
+        return f"{rounded:.{digits}f} {self.unit}"
 
     @property
     def rule(self) -> str:
-        """What is required, in words."""
+        """The requirement in words."""
         return f"{'above' if self.strict else 'at least'} {self.format_value(self.required)}"
 
     def as_dict(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""The residual-risk register: what was simulated, how it went, and what was not simulated at all.
+"""The residual-risk register: what was simulated, with which results, and what was not.
 
-Ratings of named hazards follow the paper's table 8 and can only become more severe by what a run
-measures. `field-blocking: yes` means: more evidence before the system runs unsupervised; `monitor`:
+Ratings of named hazards follow the paper's table 8; measured results can only make them more
+severe. `field-blocking: yes` means: more evidence before the system runs unsupervised; `monitor`:
 collect data in the field.
 """
 
@@ -23,7 +23,7 @@ _RATINGS = ("no", "monitor", "yes")
 
 @dataclass(frozen=True)
 class Hazard:
-    """A failure mode that someone thought of, and words by which its scenarios are known."""
+    """A failure mode, and words by which the names of its scenarios are recognised."""
 
     name: str
     words: tuple[str, ...]
@@ -50,7 +50,7 @@ HAZARDS = (
         "yes",
         "yes",
         "no",
-        "all danger is imminent: whoever appears this near cannot be warned in time",
+        "all danger is imminent: a cyclist who appears this near leaves no time for a warning",
     ),
     Hazard(
         "Cyclist above 40 km/h",
@@ -109,60 +109,52 @@ class RiskRegister:
 
     def tables(self) -> tuple[ResultTable, ResultTable]:
         """Named hazards, then scenarios."""
-        return (
-            ResultTable(
-                "register_hazards",
-                "Residual risks",
-                ("Failure mode", "Scenarios", "Sensor model", "Field-blocking", "Measured", "Why"),
-                [
-                    (
-                        h["hazard"],
-                        _coverage(h),
-                        h["sensor_model"],
-                        h["field_blocking"],
-                        h["measured"],
-                        h["reason"],
-                    )
-                    for h in self.hazards
-                ],
-                "Field-blocking yes: more evidence before the system runs unsupervised. Monitor: "
-                "collect data in the field.",
-            ),
-            ResultTable(
-                "register_scenarios",
-                "Every scenario of the suite",
-                (
-                    "Scenario",
-                    "Hazard",
-                    "Sensitivity %",
-                    "Specificity %",
-                    "SevFN %",
-                    "Min budget s",
-                    "Field-blocking",
-                    "Remark",
-                ),
-                [
-                    (
-                        s["scenario"],
-                        s["hazard"],
-                        _percent(s["sensitivity"]),
-                        _percent(s["specificity"]),
-                        _percent(s["sev_fn"]),
-                        _seconds(s["min_warning_budget_s"]),
-                        s["field_blocking"],
-                        s["remark"],
-                    )
-                    for s in self.scenarios
-                ],
-                f"Monitor: sensitivity below {100 * SENSITIVITY_MIN:g} %, specificity below "
-                f"{100 * SPECIFICITY_MIN:g} %, or a budget of at most {BUDGET_ABOVE_S:g} s. Yes: "
-                "danger without any alert. Each scenario is held against the suite's gates here, "
-                "which is stricter than the gates themselves.",
-            ),
+        hazards = ResultTable.of(
+            "register_hazards",
+            "Residual risks",
+            [{**row, "scenarios": _coverage(row)} for row in self.hazards],
+            {
+                "Failure mode": "hazard",
+                "Scenarios": "scenarios",
+                "Sensor model": "sensor_model",
+                "Field-blocking": "field_blocking",
+                "Measured": "measured",
+                "Why": "reason",
+            },
+            "Field-blocking yes: more evidence before the system runs unsupervised. Monitor: "
+            "collect data in the field.",
         )
+        shares = ("sensitivity", "specificity", "sev_fn")
+        scenarios = ResultTable.of(
+            "register_scenarios",
+            "Every scenario of the suite",
+            [
+                {
+                    **row,
+                    **{key: _percent(row[key]) for key in shares},
+                    "budget": _seconds(row["min_warning_budget_s"]),
+                }
+                for row in self.scenarios
+            ],
+            {
+                "Scenario": "scenario",
+                "Hazard": "hazard",
+                "Sensitivity %": "sensitivity",
+                "Specificity %": "specificity",
+                "SevFN %": "sev_fn",
+                "Min budget s": "budget",
+                "Field-blocking": "field_blocking",
+                "Remark": "remark",
+            },
+            f"Monitor: sensitivity below {100 * SENSITIVITY_MIN:g} %, specificity below "
+            f"{100 * SPECIFICITY_MIN:g} %, or a budget of at most {BUDGET_ABOVE_S:g} s. Yes: "
+            "danger without any alert. Each scenario is compared with the suite's gates here, "
+            "which is stricter than the gates themselves.",
+        )
+        return hazards, scenarios
 
     def markdown(self) -> str:
-        """The register as a page to print or to file."""
+        """The register as a page of Markdown."""
         parts = ["# Residual-risk register", "", f"Scenario suite `{self.suite_hash}`.", ""]
         for table in self.tables():
             parts += [f"## {table.title}", "", _row(table.columns)]
@@ -232,7 +224,7 @@ def _scenario(name: str, figures: Mapping[str, Any], hazard: str) -> dict[str, A
 
 
 def _named(hazard: Hazard, scenarios: list[dict[str, Any]]) -> dict[str, Any]:
-    """A hazard of the table with its scenarios' figures; worse where they say so."""
+    """A hazard with the results of its scenarios; rated more severe where they are bad."""
     found = [s for s in scenarios if any(w in s["scenario"].lower() for w in hazard.words)]
     coverage, rating = hazard.coverage, hazard.blocking
     reason = hazard.reason
@@ -286,5 +278,5 @@ def _row(cells: tuple[CellValue, ...], plain: bool = False) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Text that Markdown shows as it is: a scenario's name is anybody's."""
+    """Text with Markdown's special characters escaped: a scenario's name may hold any."""
     return re.sub(r"([\\`*_\[\]<>|#&])", r"\\\1", " ".join(text.split()))

@@ -1,14 +1,13 @@
-"""Contesting a decision: other scenarios, parameters or thresholds, before beside after.
+"""What-if comparison: other scenarios, parameters or thresholds, before and after.
 
-No camera, no model and no access to the pole is needed (paper, section 4: can the decision be
-contested?).
+So a decision can be contested without camera, detector or access to the pole (paper, section 4).
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import msgspec
@@ -31,7 +30,7 @@ _TRUTH_RANGE = {"cpa_radius_m": 25.0, "stopping_margin": 10.0, "ttc_bound_s": 60
 
 @dataclass(frozen=True)
 class Variant:
-    """One side of the comparison: a suite, a decision, and what they give."""
+    """One side of the comparison: a suite, a decision, and their results."""
 
     suite: Suite
     decision: DecisionConfig
@@ -43,7 +42,7 @@ class Variant:
         return Variant(suite, decision, suite.states(decision), suite.measure(decision))
 
     def part(self, name: str) -> slice:
-        """Where a scenario's frames lie."""
+        """Where a scenario's frames lie in `states`."""
         return self.suite.rule_input.frame_slice(self.suite.names.index(name))
 
     def as_dict(self) -> dict[str, Any]:
@@ -107,7 +106,7 @@ def compare_variants(
 
 
 def with_scenarios(suite: Suite, added: Sequence[Scenario]) -> Suite:
-    """The suite with further scenarios; one of a name that is there already takes its place."""
+    """The suite with further scenarios; one replaces the scenario that has its name."""
     names = [s.name for s in added]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
@@ -118,61 +117,63 @@ def with_scenarios(suite: Suite, added: Sequence[Scenario]) -> Suite:
 
 
 def parse_truth(settings: GroundTruthSettings, items: Sequence[str]) -> GroundTruthSettings:
-    """`KEY=VALUE` items over ground-truth thresholds; BikepedError names the key and the mend."""
+    """`KEY=VALUE` items over ground-truth thresholds; BikepedError names the key and the remedy."""
     for item in items:
         key, equals, text = (part.strip() for part in item.partition("="))
-        said = f"--truth {' '.join(item.split())}"
+        option = f"--truth {' '.join(item.split())}"
         if not equals:
-            raise BikepedError(f"{said}: expected KEY=VALUE, e.g. --truth cpa_radius_m=7")
+            raise BikepedError(f"{option}: expected KEY=VALUE, e.g. --truth cpa_radius_m=7")
         if key == "braking":
             if text not in BRAKING_PROFILES:
                 raise BikepedError(
-                    f"{said}: unknown profile; use one of {', '.join(BRAKING_PROFILES)}"
+                    f"{option}: unknown profile; use one of {', '.join(BRAKING_PROFILES)}"
                 )
             settings = replace(settings, braking=text)
         elif key in _TRUTH_RANGE:
-            value = _float(text, said)
+            value = _float(text, option)
             if not 0 < value <= _TRUTH_RANGE[key]:
-                raise BikepedError(f"{said}: use a value above 0 to {_TRUTH_RANGE[key]:g}")
+                raise BikepedError(f"{option}: use a value above 0 to {_TRUTH_RANGE[key]:g}")
             # The keys are checked above, the values are numbers.
             settings = replace(settings, **{key: value})  # type: ignore[arg-type]
         else:
             known = ", ".join([*_TRUTH_RANGE, "braking"])
-            raise BikepedError(f"{said}: unknown threshold; known are {known}")
+            raise BikepedError(f"{option}: unknown threshold; known are {known}")
     return settings
 
 
 def apply_bounds(decision: DecisionConfig, items: Sequence[str]) -> DecisionConfig:
-    """`KEY=LOW..HIGH` items: what the decision is when nobody may set a key outside the bound.
+    """`KEY=LOW..HIGH` items: the decision with every key inside its bound.
 
     A value outside is moved to the nearest end (either end may be left open: `d_max_m=..15`).
     """
     for item in items:
-        said = f"--bound {' '.join(item.split())}"
+        option = f"--bound {' '.join(item.split())}"
         match = re.fullmatch(r"\s*(?:decision\.)?(\w+)\s*=\s*(\S*?)\s*\.\.\s*(\S*?)\s*", item)
         if match is None or not (match[2] or match[3]):
-            raise BikepedError(f"{said}: expected KEY=LOW..HIGH, e.g. --bound d_max_m=5..15")
+            raise BikepedError(f"{option}: expected KEY=LOW..HIGH, e.g. --bound d_max_m=5..15")
         key = match[1]
         value = getattr(decision, key, None)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             numbers = [
                 k for k, v in msgspec.to_builtins(decision).items() if type(v) in (int, float)
             ]
-            raise BikepedError(f"{said}: not a number of the decision; known: {', '.join(numbers)}")
-        low = _float(match[2], said) if match[2] else -np.inf
-        high = _float(match[3], said) if match[3] else np.inf
+            raise BikepedError(
+                f"{option}: not a number of the decision; known: {', '.join(numbers)}"
+            )
+        low = _float(match[2], option) if match[2] else -np.inf
+        high = _float(match[3], option) if match[3] else np.inf
         if low > high:
-            raise BikepedError(f"{said}: {low:g} is above {high:g}; exchange them")
+            raise BikepedError(f"{option}: {low:g} is above {high:g}; exchange them")
         moved = min(max(value, low), high)
         if isinstance(value, int) and moved != value:
             moved = int(np.ceil(moved) if moved == low else np.floor(moved))
             if not low <= moved <= high:
-                raise BikepedError(f"{said}: holds no whole number; widen it")
+                raise BikepedError(f"{option}: holds no whole number; widen it")
         data = {**msgspec.to_builtins(decision), key: moved}
         try:
             decision = msgspec.convert(data, DecisionConfig, strict=True)
         except msgspec.ValidationError as error:
-            raise BikepedError(f"{said}: {error}; choose a bound that the key allows") from error
+            raise BikepedError(f"{option}: {error}; choose a bound that the key allows") from error
     if decision.d_min_m > decision.d_max_m:
         raise BikepedError(
             f"--bound: d_min_m {decision.d_min_m:g} comes to lie above d_max_m "
@@ -182,13 +183,8 @@ def apply_bounds(decision: DecisionConfig, items: Sequence[str]) -> DecisionConf
 
 
 def truth_dict(settings: GroundTruthSettings) -> dict[str, Any]:
-    """The thresholds of ground truth for JSON; null: the definition's own."""
-    return {
-        "cpa_radius_m": settings.cpa_radius_m,
-        "stopping_margin": settings.stopping_margin,
-        "ttc_bound_s": settings.ttc_bound_s,
-        "braking": settings.braking,
-    }
+    """The ground-truth thresholds for JSON; null: the definition's own."""
+    return asdict(settings)
 
 
 def _differences(old: Variant, new: Variant, name: str, index: int) -> dict[str, Any]:
@@ -227,11 +223,11 @@ def _spans(
     ]
 
 
-def _float(text: str, said: str) -> float:
+def _float(text: str, option: str) -> float:
     try:
         value = float(text)
     except ValueError as error:
-        raise BikepedError(f"{said}: {text!r} is not a number; write digits") from error
+        raise BikepedError(f"{option}: {text!r} is not a number; write digits") from error
     if not np.isfinite(value):
-        raise BikepedError(f"{said}: {text!r} is not a finite number; write digits")
+        raise BikepedError(f"{option}: {text!r} is not a finite number; write digits")
     return value

@@ -1,6 +1,6 @@
-"""docs/scenarios.md says what the 24 scenario files hold.
+"""docs/scenarios.md describes the 24 scenario files.
 
-`python tests/conformance/test_conformance_docs.py` writes it anew.
+`python tests/lab/scenarios/test_scenarios_docs.py` writes it.
 """
 
 import sys
@@ -12,25 +12,25 @@ from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.truth import compute_ground_truth
 
 PAGE = Path(__file__).parents[3] / "docs" / "scenarios.md"
-FOLDER = "../bikeped/conformance/scenarios"
+FOLDER = "../bikeped/lab/scenarios/bundled"
 INTRO = """\
 # The 24 scenarios
 
-<!-- Written by `python tests/conformance/test_conformance_docs.py`; a test compares. -->
+<!-- Written by `python tests/lab/scenarios/test_scenarios_docs.py`; a test compares. -->
 
-What the conformance simulation runs: one file a scenario, in
-[bikeped/conformance/scenarios]({folder}).
-They are conformance cases: kinds of encounter that the system must handle, and no statistical
+The suite of the conformance simulation: one file a scenario, in
+[bikeped/lab/scenarios/bundled]({folder}).
+They are conformance cases: kinds of encounter that the system must handle, not a statistical
 sample of traffic; none is a recorded event. The world is a plan in metres, x east and y north; the
 crosswalk lies along x = 5, the camera stands at (5, -13) and looks north. Pedestrians walk at 1.0
 to 1.6 m/s (a child 0.9, a wheelchair 0.6, one runner 2.5), cyclists ride at 3 to 8 m/s, e-bikes
 and e-scooters at 6 to 12.5.
 
-Danger frames are those that the kinematic truth calls dangerous (30 a second); of these the
+Danger frames are those with danger in the kinematic ground truth (30 a second); of these the
 actionable ones leave a distracted pedestrian time to react (TTC of at least 1.87 s).
 {danger} of the {count} scenarios hold danger, {actionable} actionable danger: Fast Approach and
 Occluded Emergence are over too soon for any warning. `--scenarios DIR` on every conformance command
-takes your own files in their place.
+runs your own files instead.
 """
 SWERVE = """
 **Swerving Cyclist** shows a limit of the rule, on purpose: while the cyclist cuts in, the way
@@ -68,8 +68,8 @@ def agents(scenario):
 
 
 def test_the_page_is_current(suite):
-    mend = "run: python tests/conformance/test_conformance_docs.py"
-    assert PAGE.read_text(encoding="utf-8") == page(suite.scenarios), mend
+    remedy = "run: python tests/lab/scenarios/test_scenarios_docs.py"
+    assert PAGE.read_text(encoding="utf-8") == page(suite.scenarios), remedy
 
 
 if __name__ == "__main__":
