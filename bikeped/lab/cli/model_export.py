@@ -98,7 +98,7 @@ def command(
 
         half = not full_precision
         built = build_engine(model, engine, half=half, workspace_mb=workspace_mb, size=input_wh)
-        summary |= built.as_dict()
+        summary |= built
     report(summary, json_path, _lines(summary))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,27 +20,6 @@ _MB = 1 << 20
 _OLDEST = 10  #: TensorRT's major version; JetPack 6 has 10
 
 
-@dataclass(frozen=True)
-class EngineSummary:
-    """The engine file."""
-
-    path: Path
-    source: Path
-    bytes: int
-    tensorrt: str
-    half: bool
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "engine": str(self.path),
-            "from": str(self.source),
-            "engine_bytes": self.bytes,
-            "tensorrt": self.tensorrt,
-            "half_precision": self.half,
-        }
-
-
 def build_engine(
     model: Path,
     out: Path,
@@ -49,11 +27,12 @@ def build_engine(
     half: bool = True,
     workspace_mb: int = 2048,
     size: tuple[int, int] | None = None,
-) -> EngineSummary:
-    """Builds `out` from the ONNX file `model`; takes minutes. Raises DetectorError.
+) -> dict[str, Any]:
+    """Builds `out` from the ONNX file `model`, in minutes; returns a summary for JSON.
 
     `half` allows 16-bit floats where the GPU has fast ones; `workspace_mb` bounds the memory of the
     search. `size`: input width and height, for a model of any size; None: as its metadata say.
+    Raises DetectorError.
     """
     trt = _tensorrt(out)
     try:
@@ -88,7 +67,13 @@ def build_engine(
     header = json.dumps(facts).encode("utf-8")
     data = len(header).to_bytes(4, "little") + header + bytes(plan)
     write_whole(out, data)
-    return EngineSummary(out, model, len(data), str(trt.__version__), half)
+    return {
+        "engine": str(out),
+        "from": str(model),
+        "engine_bytes": len(data),
+        "tensorrt": str(trt.__version__),
+        "half_precision": half,
+    }
 
 
 def _fix_size(

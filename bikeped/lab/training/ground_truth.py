@@ -7,7 +7,6 @@ function that joins the detector's boxes.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -16,10 +15,11 @@ from bikeped.detection.classes import WITH_RIDER
 from bikeped.detection.riders import join_riders
 from bikeped.lab.training.coco import CocoData, CocoImage, CocoObject
 from bikeped.lab.training.measures import GroundTruth
-from bikeped.types import Detections, Kind
+from bikeped.types import Detections, FloatArray, Kind
 
 #: Side of the network input that areas are measured at (definitions, section 3).
 INPUT_PX = 1280
+_Row = tuple[int, int, bool, float, FloatArray]
 
 
 def kinds_by_name(names: Mapping[int, str], detection: DetectionConfig) -> dict[int, Kind]:
@@ -38,19 +38,21 @@ def kinds_by_name(names: Mapping[int, str], detection: DetectionConfig) -> dict[
 
 def category_truth(data: CocoData, group_of: Mapping[int, int]) -> GroundTruth:
     """Boxes with their categories mapped by `group_of`; others are left out."""
-    rows = _TruthBuilder()
-    for number, picture in enumerate(data.images):
-        for thing in data.objects[picture.id]:
-            if thing.category_id in group_of:
-                rows.add(number, picture, group_of[thing.category_id], thing)
-    return rows.truth()
+    return _truth(
+        [
+            _row(number, picture, group_of[thing.category_id], thing)
+            for number, picture in enumerate(data.images)
+            for thing in data.objects[picture.id]
+            if thing.category_id in group_of
+        ]
+    )
 
 
 def road_user_truth(
     data: CocoData, kind_of: Mapping[int, Kind], detection: DetectionConfig
 ) -> GroundTruth:
     """Road users by kind, riders joined to their cycles."""
-    rows = _TruthBuilder()
+    rows: list[_Row] = []
     bare = {
         i
         for i, kind in kind_of.items()
@@ -62,9 +64,9 @@ def road_user_truth(
         parts: list[CocoObject] = []
         if any(t.category_id in bare and not t.crowd for t in things):
             parts = [t for t in things if t.category_id in bare | people and not t.crowd]
-        for thing in things:
-            if thing not in parts:
-                rows.add(number, picture, int(kind_of[thing.category_id]), thing)
+        rows += [
+            _row(number, picture, int(kind_of[t.category_id]), t) for t in things if t not in parts
+        ]
         joined = join_riders(
             Detections(
                 np.array([kind_of[t.category_id] for t in parts], np.int8),
@@ -75,34 +77,26 @@ def road_user_truth(
             detection.confidence,
         )
         for kind, box in zip(joined.kind.tolist(), joined.box_px.tolist(), strict=True):
-            rows.add(number, picture, kind, CocoObject(0, picture.id, 0, tuple(box)))
-    return rows.truth()
+            rows.append(_row(number, picture, kind, CocoObject(0, picture.id, 0, tuple(box))))
+    return _truth(rows)
 
 
-class _TruthBuilder:
-    """Objects gathered for a `GroundTruth`, boxes in pixels at the network's input."""
+def _row(number: int, picture: CocoImage, group: int, thing: CocoObject) -> _Row:
+    """One object of picture `number`, its box in pixels at the network's input."""
+    scale = INPUT_PX / max(picture.width, picture.height)
+    distance_m = np.nan if thing.distance_m is None else thing.distance_m
+    return number, group, thing.crowd, distance_m, np.multiply(thing.box_px, scale)
 
-    def __init__(self) -> None:
-        self._rows: list[tuple[int, int, bool, float]] = []
-        self._boxes: list[Any] = []
 
-    def add(self, number: int, picture: CocoImage, group: int, thing: CocoObject) -> None:
-        """One object of picture `number`."""
-        scale = INPUT_PX / max(picture.width, picture.height)
-        distance_m = np.nan if thing.distance_m is None else thing.distance_m
-        self._rows.append((number, group, thing.crowd, distance_m))
-        self._boxes.append(np.multiply(thing.box_px, scale))
-
-    def truth(self) -> GroundTruth:
-        """All of them."""
-        rows = self._rows
-        return GroundTruth(
-            np.array([row[0] for row in rows], np.int64),
-            np.array([row[1] for row in rows], np.int64),
-            np.array(self._boxes, np.float64).reshape(-1, 4),
-            np.array([row[2] for row in rows], np.bool_),
-            np.array([row[3] for row in rows], np.float64),
-        )
+def _truth(rows: list[_Row]) -> GroundTruth:
+    number, group, crowd, distance_m, box = zip(*rows, strict=True) if rows else [()] * 5
+    return GroundTruth(
+        np.array(number, np.int64),
+        np.array(group, np.int64),
+        np.array(box, np.float64).reshape(-1, 4),
+        np.array(crowd, np.bool_),
+        np.array(distance_m, np.float64),
+    )
 
 
 def plain_name(name: str) -> str:

@@ -141,8 +141,8 @@ def test_an_engine_carries_the_facts_in_front(trt, model, tmp_path):
     header, plan = split_header(out.read_bytes())
     assert header == FACTS
     assert bytes(plan) == PLAN
-    assert summary.as_dict()["engine_bytes"] == out.stat().st_size
-    assert summary.half
+    assert summary["engine_bytes"] == out.stat().st_size
+    assert summary["half_precision"]
     assert Builder.last.flags == {BuilderFlag.FP16}
     assert Builder.last.limits == {MemoryPoolType.WORKSPACE: 64 << 20}
 
@@ -164,10 +164,10 @@ def test_an_input_of_any_size_gets_the_one_it_will_have(trt, model, tmp_path):
 
 
 def test_half_precision_only_where_it_is_asked_for_and_there(trt, model, tmp_path):
-    assert not build_engine(model, tmp_path / "a.engine", half=False).half
+    assert not build_engine(model, tmp_path / "a.engine", half=False)["half_precision"]
     assert Builder.last.flags == set()
     trt.Builder.platform_has_fast_fp16 = False
-    assert not build_engine(model, tmp_path / "b.engine").half
+    assert not build_engine(model, tmp_path / "b.engine")["half_precision"]
     assert Builder.last.flags == set()
 
 
