@@ -64,4 +64,6 @@ def light_driver(config: FeedbackConfig) -> LightDriver:
     ever and reported in `LightDriver.fault`.
     """
     check_light(config)
-    return LightDriver(partial(open_light, config), fault_blink_hz=config.fault_blink_hz)
+    return LightDriver(
+        partial(open_light, config), name=config.light, fault_blink_hz=config.fault_blink_hz
+    )

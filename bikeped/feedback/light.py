@@ -97,16 +97,17 @@ class LightDriver:
     """Shows signals on a light, from its own thread, and reports when the light does not obey.
 
     `open_light` opens the device, in the thread, at the start and after every error, with pauses
-    that double from `retry_s[0]` to `retry_s[1]` seconds. Without a `show` for `watchdog_s` the
-    light shows FAULT. A device call longer than `hang_s` is a fault. An unchanged colour is sent
-    again every `assert_s`, so that an unplugged or replugged light is noticed. A newer signal
-    replaces one that was not shown yet.
+    that double from `retry_s[0]` to `retry_s[1]` seconds; `name` is its kind, as in
+    `feedback.light`. Without a `show` for `watchdog_s` the light shows FAULT. A device call longer
+    than `hang_s` is a fault. An unchanged colour is sent again every `assert_s`, so that an
+    unplugged or replugged light is noticed. A newer signal replaces one that was not shown yet.
     """
 
     def __init__(
         self,
         open_light: Callable[[], Light],
         *,
+        name: str = "simulated",
         fault_blink_hz: float = 0.5,
         watchdog_s: float = 1.0,
         hang_s: float = 2.0,
@@ -114,6 +115,7 @@ class LightDriver:
         retry_s: tuple[float, float] = (0.5, 30.0),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self.name = name
         self._open_light = open_light
         self._watchdog_signal = fault_signal((NOT_REFRESHED,), fault_blink_hz)
         self._watchdog_s = watchdog_s

@@ -18,7 +18,6 @@ from bikeped.config import LoadedConfig, road_region
 from bikeped.cores import cores
 from bikeped.detection.load import load_detector
 from bikeped.errors import DetectorError
-from bikeped.faults import Fault
 from bikeped.feedback import LightDriver, SignalLogic, Speaker
 from bikeped.pipeline.detection_stage import (
     MAX_INFLIGHT,
@@ -101,10 +100,10 @@ def new_event_header(loaded: LoadedConfig, detector: FrameDetector) -> EventHead
 class Application:
     """The loop from `feed` to `light`, with the parts that the configuration asks for.
 
-    `source` names the camera or the recording, `light_name` the kind of light. What is started is
-    stopped when `stack` unwinds. `outputs` take every frame result after telemetry; `view_width`:
-    pixels that their pictures need; `latency_frames`: over how many frames percentiles are taken.
-    Raises TelemetryError for MQTT settings that cannot work.
+    `source` names the camera or the recording. What is started is stopped when `stack` unwinds.
+    `outputs` take every frame result after telemetry; `view_width`: pixels that their pictures
+    need; `latency_frames`: over how many frames percentiles are taken. Raises TelemetryError for
+    MQTT settings that cannot work.
     """
 
     def __init__(
@@ -117,7 +116,6 @@ class Application:
         feed: Feed,
         source: str,
         light: LightDriver,
-        light_name: str,
         mqtt: bool,
         pages: Pages | None = None,
         speaker: Speaker | None = None,
@@ -128,30 +126,24 @@ class Application:
         on_tick: Callable[[], None] = lambda: None,
         latency_frames: int = 900,
     ) -> None:
-        self._loaded, self._detector, self._stack = loaded, detector, stack
-        self._track_and_decide, self._source = track_and_decide, source
-        self._light, self._light_name = light, light_name
-        self._pages, self._metrics = pages, Metrics() if pages is not None else None
-        self._publisher: MqttPublisher | None = None
+        self._stack, self._light, self._pages = stack, light, pages
+        publisher = None
         if mqtt:
-            self._publisher = MqttPublisher(loaded.config.mqtt, base_dir=loaded.base_dir)
-            self._publisher.start()
-            stack.push_async_callback(asyncio.to_thread, self._publisher.stop)
+            publisher = MqttPublisher(loaded.config.mqtt, base_dir=loaded.base_dir)
+            publisher.start()
+            stack.push_async_callback(asyncio.to_thread, publisher.stop)
+        metrics = Metrics()
         self.telemetry = Telemetry(
             loaded,
             track_and_decide,
-            publisher=self._publisher,
+            publisher=publisher,
             audit=audit,
-            metrics=self._metrics,
+            metrics=None if pages is None else metrics,
             remember=latency_frames,
         )
         watchers = () if pages is None else (pages,)
-        self.dispatcher = SignalDispatcher(
-            SignalLogic.from_config(loaded.config.feedback),
-            light,
-            speaker,
-            listeners=(self.telemetry, *watchers),
-        )
+        logic = SignalLogic.from_config(loaded.config.feedback)
+        self.dispatcher = SignalDispatcher(logic, light, speaker, (self.telemetry, *watchers))
         self.loop = Loop(
             feed=feed,
             detection=DetectionStage(detector, view_width),
@@ -163,38 +155,33 @@ class Application:
             max_inflight=detector.max_inflight if isinstance(detector, DetectorPool) else 1,
             fault_sources=(
                 lambda: None if speaker is None else speaker.fault,
-                lambda: _audit_fault(audit),
+                lambda: None if audit is None else audit.fault,
                 lambda: light.fault,
             ),
+        )
+        self._web_context = WebContext(
+            loaded=loaded,
+            track_and_decide=track_and_decide,
+            source=source,
+            detector=detector.name,
+            health=self._health,
+            metrics=metrics.registry,
+            mqtt=None if publisher is None else lambda: publisher.status,
         )
 
     async def serve_pages(self) -> HttpServer | None:
         """Serves the pages, if there are any. A port that cannot be bound is in `error`."""
-        if self._pages is None or self._metrics is None:
+        if self._pages is None:
             return None
-        publisher = self._publisher
-        context = WebContext(
-            loaded=self._loaded,
-            track_and_decide=self._track_and_decide,
-            source=self._source,
-            detector=self._detector.name,
-            health=self._health,
-            metrics=self._metrics.registry,
-            mqtt=None if publisher is None else lambda: publisher.status,
-        )
-        server = HttpServer(self._pages.application(context), self._loaded.config.web)
+        context = self._web_context
+        server = HttpServer(self._pages.application(context), context.loaded.config.web)
         await server.start()
         self._stack.push_async_callback(server.stop)
         return server
 
     async def run(self) -> None:
         """Runs the loop (see `Loop.run`), reporting health meanwhile and once at the end."""
-        interval_s = self._loaded.config.mqtt.health_interval_s
-        reporting = asyncio.create_task(
-            report_health(
-                self.telemetry, self.loop, self._health, interval_s, lambda: self._light.errors
-            )
-        )
+        reporting = asyncio.create_task(report_health(self.telemetry, self.loop, self._light))
         try:
             await self.loop.run()
         finally:
@@ -202,9 +189,4 @@ class Application:
             self.telemetry.publish_health(self._health())
 
     def _health(self) -> HealthMessage:
-        return self.telemetry.health(self.loop, self._light_name)
-
-
-def _audit_fault(audit: AuditLog | None) -> Fault | None:
-    detail = None if audit is None else audit.fault
-    return None if detail is None else Fault("audit", "audit.error", detail)
+        return self.telemetry.health(self.loop, self._light.name)

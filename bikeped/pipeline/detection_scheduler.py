@@ -17,6 +17,7 @@ from bikeped.pipeline.fault_monitor import FaultMonitor
 from bikeped.pipeline.feed import Feed
 from bikeped.pipeline.frame_result import FrameCounts
 from bikeped.pipeline.runtime import RateLimitedLogger, WorkerThread
+from bikeped.pipeline.track_and_decide import GroundMapper
 
 
 class LatestFrameSlot:
@@ -24,35 +25,28 @@ class LatestFrameSlot:
 
     def __init__(self) -> None:
         self._item: DecodedFrame | None = None
-        self._full, self._empty = asyncio.Event(), asyncio.Event()
-        self._empty.set()
+        self.empty = asyncio.Event()
+        self.full = asyncio.Event()  #: also set at the end
+        self.empty.set()
         self.ended = False
-
-    async def wait_empty(self) -> None:
-        """Returns when the slot is empty."""
-        await self._empty.wait()
-
-    async def wait_full(self) -> None:
-        """Returns when there is a frame, or the end."""
-        await self._full.wait()
 
     def put(self, item: DecodedFrame | None) -> None:
         """Fills the slot."""
         self._item = item
         self.ended = item is None
-        self._empty.clear()
-        self._full.set()
+        self.empty.clear()
+        self.full.set()
 
     def get_nowait(self) -> DecodedFrame | None:
         """The frame, if there is one now."""
         item, self._item = self._item, None
         if item is not None:
-            self._full.clear()
-            self._empty.set()
+            self.full.clear()
+            self.empty.set()
         return item
 
 
-async def first_of(future: asyncio.Future[Any], other: Coroutine[Any, Any, None]) -> None:
+async def first_of(future: asyncio.Future[Any], other: Coroutine[Any, Any, object]) -> None:
     """Returns when one of the two is done; cancels `other`, never `future`."""
     task = asyncio.ensure_future(other)
     try:
@@ -79,10 +73,9 @@ class _InFlight:
 class DetectionScheduler:
     """Takes frames from `feed`, decodes and detects them in threads, awaits `on_answer` for each.
 
-    One thread decodes, `max_inflight` threads detect. `check_size` raises nothing and returns why a
-    frame of this width and height does not fit the configured camera. On a live feed a frame that
-    fails costs itself, is counted and reported to `monitor`; in a recording the error ends
-    `detect_frames`, after the frames before it were passed on.
+    One thread decodes, `max_inflight` threads detect. On a live feed a frame that fails, or does
+    not fit the camera of `ground_mapper`, costs itself, is counted and reported to `monitor`; in a
+    recording the error ends `detect_frames`, after the frames before it were passed on.
     """
 
     def __init__(
@@ -91,7 +84,7 @@ class DetectionScheduler:
         detection: DetectionStage,
         monitor: FaultMonitor,
         counts: FrameCounts,
-        check_size: Callable[[int, int], GeometryError | None],
+        ground_mapper: GroundMapper,
         on_size_error: Callable[[], None],
         on_answer: Callable[[DecodedFrame, DetectionResult], Awaitable[None]],
         *,
@@ -100,7 +93,7 @@ class DetectionScheduler:
     ) -> None:
         self._feed, self._detection = feed, detection
         self._monitor, self._counts = monitor, counts
-        self._check_size, self._on_size_error = check_size, on_size_error
+        self._ground_mapper, self._on_size_error = ground_mapper, on_size_error
         self._on_answer, self._clock = on_answer, clock
         self._slot = LatestFrameSlot()
         self._decoder = WorkerThread("decode", clock)
@@ -118,7 +111,7 @@ class DetectionScheduler:
         """Decodes frame after frame, until the feed ends."""
         while True:
             # Room first, then the frame: a live frame taken early would only grow old.
-            await self._slot.wait_empty()
+            await self._slot.empty.wait()
             await self._wait_for_detector()
             taken = await self._feed.next_frame()
             if taken is None:
@@ -159,10 +152,10 @@ class DetectionScheduler:
             while not (slot.ended and not inflight):
                 self._dispatch()
                 if not inflight:
-                    await slot.wait_full()
+                    await slot.full.wait()
                     continue
                 if self._idle and not slot.ended:
-                    await first_of(inflight[0].answer, slot.wait_full())
+                    await first_of(inflight[0].answer, slot.full.wait())
                 else:
                     await asyncio.wait({inflight[0].answer})
                 if not inflight[0].answer.done():
@@ -182,7 +175,11 @@ class DetectionScheduler:
     def _dispatch(self) -> None:
         """Hands the waiting frame to an idle detector thread."""
         while self._idle and (decoded := self._slot.get_nowait()) is not None:
-            error = self._check_size(decoded.frame.width, decoded.frame.height)
+            error = None
+            try:
+                self._ground_mapper.framing_for(decoded.frame.width, decoded.frame.height)
+            except GeometryError as misfit:
+                error = misfit
             if self._feed.live:
                 self._monitor.sized(error)
                 if error is not None:

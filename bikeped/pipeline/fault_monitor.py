@@ -6,6 +6,7 @@ single bad frames between good ones are no fault. What each fault does is in `bi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -38,6 +39,9 @@ class Limits:
 
 
 DEFAULT_LIMITS = Limits()
+
+#: Code of the fault of an age -> its source, and what is missing.
+_AGED = {"camera.no_frame": ("camera", "frame"), "detector.no_answer": ("detector", "answer")}
 
 
 @dataclass(frozen=True)
@@ -98,17 +102,17 @@ class FaultMonitor:
         """The faults with which the light must show FAULT; empty when the decision holds."""
         if not self._feed.live:
             return ()
-        error = self._feed.error()
-        faults = [
-            *_frame_age(now_s, self._feed.newest_s(now_s), self._limits.stale_after_s),
-            *_answer_age(now_s, self._answered_s, self._limits.silent_after_s),
-            *([] if self._frame_size is None else [self._frame_size]),
-            *([] if error is None else [Fault("camera", "camera.error", error)]),
+        error, limits = self._feed.error(), self._limits
+        faults: list[Fault | None] = [
+            _age_fault("camera.no_frame", now_s, self._feed.newest_s(now_s), limits.stale_after_s),
+            _age_fault("detector.no_answer", now_s, self._answered_s, limits.silent_after_s),
+            self._frame_size,
+            None if error is None else Fault("camera", "camera.error", error),
             *self._from_sources(Effect.FAULT),
         ]
-        if faults:  # the cause, where a stage fails; one bad frame among good ones is no fault
+        if any(faults):  # the cause, where a stage fails; one bad frame among good ones is no fault
             faults += [run.fault for run in (self._undecodable, self._failing) if run is not None]
-        return tuple(faults)
+        return tuple(fault for fault in faults if fault is not None)
 
     def notices(self) -> tuple[Fault, ...]:
         """The faults of other parts that leave the light as decided."""
@@ -140,28 +144,14 @@ class FaultMonitor:
             self._feed.restart()
 
 
-def _frame_age(now_s: float, newest_s: float | None, stale_after_s: float) -> list[Fault]:
-    problem, future = _age_problem("frame", now_s, newest_s, stale_after_s)
-    code = "camera.future_time" if future else "camera.no_frame"
-    return [] if problem is None else [Fault("camera", code, problem)]
-
-
-def _answer_age(now_s: float, newest_s: float | None, silent_after_s: float) -> list[Fault]:
-    problem, future = _age_problem("answer", now_s, newest_s, silent_after_s)
-    code = "detector.future_time" if future else "detector.no_answer"
-    return [] if problem is None else [Fault("detector", code, problem)]
-
-
-def _age_problem(
-    what: str, now_s: float, newest_s: float | None, limit_s: float
-) -> tuple[str | None, bool]:
-    """What is wrong with the age of the newest `what`, and whether its time is in the future."""
-    if newest_s is None:
-        return f"no {what} yet", False
-    age_s = now_s - newest_s
-    # Written so that a NaN age is a fault, too.
-    if not age_s <= limit_s:
-        return f"no {what} for more than {limit_s:g} s", False
+def _age_fault(code: str, now_s: float, newest_s: float | None, limit_s: float) -> Fault | None:
+    """The fault of a newest frame or answer: `code` if missing or too old, or a future time."""
+    component, what = _AGED[code]
+    age_s = math.nan if newest_s is None else now_s - newest_s
     if age_s < -limit_s:
-        return f"no {what} with a usable time: the newest lies in the future", True
-    return None, False
+        problem = f"no {what} with a usable time: the newest lies in the future"
+        return Fault(component, f"{component}.future_time", problem)
+    if age_s <= limit_s:  # false for a NaN age, so that it is a fault, too
+        return None
+    problem = f"no {what} yet" if newest_s is None else f"no {what} for more than {limit_s:g} s"
+    return Fault(component, code, problem)

@@ -1,9 +1,7 @@
-"""The result of one frame, and how it reaches telemetry, files and pages."""
+"""The result of one frame: its latencies, and what to draw of it."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,11 +10,8 @@ import numpy as np
 from bikeped.detection.base import DetectionResult
 from bikeped.overlay import GroundToFrame, OverlayData, ground_projector
 from bikeped.pipeline.detection_stage import DecodedFrame
-from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.track_and_decide import TrackAndDecide, TrackingResult
 from bikeped.types import Detections, Signal
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -47,26 +42,6 @@ class FrameResultListener(Protocol):
 
     async def on_frame_result(self, result: FrameResult) -> None:
         """One frame's result. On a live feed it is only queued: the loop waits for this."""
-
-
-class FrameResultDispatcher:
-    """Hands every result to all listeners; a listener's error ends a replay, never a live loop."""
-
-    def __init__(self, listeners: Sequence[FrameResultListener], *, live: bool) -> None:
-        self._listeners, self._live = tuple(listeners), live
-        self._limited_log = RateLimitedLogger(log)
-
-    async def dispatch(self, result: FrameResult) -> None:
-        for listener in self._listeners:
-            await self._send(listener, result)
-
-    async def _send(self, listener: FrameResultListener, result: FrameResult) -> None:
-        try:
-            await listener.on_frame_result(result)
-        except Exception as error:
-            if not self._live:
-                raise
-            self._limited_log.failure("output", error)
 
 
 def stage_latencies(

@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Sequence
 
 from bikeped.detection.base import DetectionResult
-from bikeped.errors import GeometryError
 from bikeped.faults import Fault
 from bikeped.pipeline.detection_scheduler import DetectionScheduler
 from bikeped.pipeline.detection_stage import DecodedFrame, DetectionStage
@@ -26,7 +25,6 @@ from bikeped.pipeline.feed import Feed
 from bikeped.pipeline.frame_result import (
     FrameCounts,
     FrameResult,
-    FrameResultDispatcher,
     FrameResultListener,
     stage_latencies,
 )
@@ -58,35 +56,25 @@ class Loop:
         max_inflight: int = 1,
         fault_sources: Sequence[Callable[[], Fault | None]] = (),
     ) -> None:
-        self._feed, self._detection, self._track_and_decide = feed, detection, track_and_decide
-        self._dispatcher = dispatcher
-        self._results = FrameResultDispatcher(outputs, live=feed.live)
+        self.feed, self._detection, self._track_and_decide = feed, detection, track_and_decide
+        self._dispatcher, self._outputs = dispatcher, tuple(outputs)
         self._limits, self._clock, self._on_tick = limits, clock, on_tick
         self._max_inflight = max_inflight
         self.monitor = FaultMonitor(feed, limits, fault_sources)
         self.counts = FrameCounts()
         self._limited_log = RateLimitedLogger(log)
-        self._stop = asyncio.Event()
+        self.stopping = asyncio.Event()
         self._first_s: float | None = None  # capture time of the first result
         self._newest_s: float | None = None  # capture time of the newest result
 
     def stop(self) -> None:
         """Ends `run`; callable from a signal handler."""
-        self._stop.set()
-
-    @property
-    def stopping(self) -> bool:
-        """Whether `stop` was called."""
-        return self._stop.is_set()
-
-    def dropped(self) -> int:
-        """Frames replaced by a newer one before they were taken."""
-        return self._feed.dropped()
+        self.stopping.set()
 
     def frame_age_s(self) -> float | None:
         """Age of the newest frame of a live feed; None before the first."""
         now_s = self._clock()
-        newest_s = self._feed.newest_s(now_s)
+        newest_s = self.feed.newest_s(now_s)
         return None if newest_s is None else max(0.0, now_s - newest_s)
 
     async def run(self) -> None:
@@ -98,24 +86,24 @@ class Loop:
         daemons.
         """
         scheduler = DetectionScheduler(
-            self._feed,
+            self.feed,
             self._detection,
             self.monitor,
             self.counts,
-            self._frame_size_error,
+            self._track_and_decide.ground_mapper,
             self._show_without_frame,
             self._process,
             max_inflight=self._max_inflight,
             clock=self._clock,
         )
         detecting = asyncio.create_task(scheduler.detect_frames(), name="detect")
-        stopping = asyncio.create_task(self._stop.wait(), name="stop")
+        stopping = asyncio.create_task(self.stopping.wait(), name="stop")
         tasks: set[asyncio.Task[None] | asyncio.Task[bool]] = {
             detecting,
             stopping,
             asyncio.create_task(scheduler.decode_frames(), name="decode"),
         }
-        if self._feed.live:
+        if self.feed.live:
             tasks.add(asyncio.create_task(self._tick(scheduler), name="tick"))
         try:
             pending = set(tasks)
@@ -135,15 +123,7 @@ class Loop:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            await asyncio.gather(scheduler.close(self._limits.close_s), self._feed.close())
-
-    def _frame_size_error(self, width: int, height: int) -> GeometryError | None:
-        """Why a frame of this size does not fit the configured camera, or None."""
-        try:
-            self._track_and_decide.ground_mapper.framing_for(width, height)
-        except GeometryError as error:
-            return error
-        return None
+            await asyncio.gather(scheduler.close(self._limits.close_s), self.feed.close())
 
     async def _process(self, decoded: DecodedFrame, answer: DetectionResult) -> None:
         """Tracks and decides one answered frame, sets the light, and passes the result on."""
@@ -156,27 +136,32 @@ class Loop:
             return
         self._newest_s = frame.captured_s
         # A recording has no other time than its own.
-        now_s = self._clock() if self._feed.live else frame.captured_s
+        now_s = self._clock() if self.feed.live else frame.captured_s
+        age_s = max(0.0, now_s - frame.captured_s)
         tracking = self._track_and_decide.update(
-            answer.detections,
-            frame.width,
-            frame.height,
-            frame.captured_s,
-            max(0.0, now_s - frame.captured_s),
+            answer.detections, frame.width, frame.height, frame.captured_s, age_s
         )
         self.monitor.processed(frame.captured_s)
         self.counts.frames += 1
         began = time.perf_counter()
         signal = self._dispatcher.dispatch(now_s, tracking.decision, self.monitor.faults(now_s))
         ended = time.perf_counter()
-        total_ms = (ended - decoded.received_s) * 1e3 if self._feed.live else None
+        total_ms = (ended - decoded.received_s) * 1e3 if self.feed.live else None
         latency_ms = stage_latencies(decoded, answer, tracking, (ended - began) * 1e3, total_ms)
         if self._first_s is None:
             self._first_s = frame.captured_s
         t_s = frame.captured_s - self._first_s
-        await self._results.dispatch(
-            FrameResult(decoded, t_s, answer.detections, tracking, signal, latency_ms)
-        )
+        result = FrameResult(decoded, t_s, answer.detections, tracking, signal, latency_ms)
+        for listener in self._outputs:
+            await self._pass_on(result, listener)
+
+    async def _pass_on(self, result: FrameResult, listener: FrameResultListener) -> None:
+        try:
+            await listener.on_frame_result(result)
+        except Exception as error:
+            if not self.feed.live:
+                raise
+            self._limited_log.failure("output", error)
 
     def _show_without_frame(self) -> None:
         """Updates the signal without a new decision."""

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import signal as signals
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from bikeped.pipeline.application import Application, Pages, load_detector_pool,
 from bikeped.pipeline.detection_stage import FrameDetector
 from bikeped.pipeline.feed import RecordedFeed, open_configured
 from bikeped.pipeline.frame_result import FrameResultListener
-from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.replay_outputs import OVERLAY_SIZE, EventFile, OverlayVideo, ReplaySummary
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
 from bikeped.telemetry.latency import StageTimes
@@ -48,13 +47,16 @@ class ReplayResult:
 
     summary: ReplaySummary
     times: StageTimes
-    frames: int
     undecodable: int
     wall_s: float
     config_hash: str
     detector: str
-    interrupted: bool = False  #: stopped by a signal: all figures cover only what came before
-    warnings: tuple[str, ...] = ()
+    interrupted: bool  #: stopped by a signal: all figures cover only what came before
+
+    @property
+    def frames(self) -> int:
+        """Frames that led to a decision."""
+        return self.summary.frames
 
     def as_dict(self) -> dict[str, Any]:
         """The summary, for `--json`."""
@@ -69,7 +71,7 @@ class ReplayResult:
             "alerts": summary.alerts,
             "detections": summary.detections,
             "not_on_ground": summary.not_on_ground,
-            "warnings": list(self.warnings),
+            "warnings": summary.warnings,
             "detector": self.detector,
             "config_hash": self.config_hash,
             "frames_per_second": round(self.frames / max(self.wall_s, 1e-9), 2),
@@ -112,21 +114,15 @@ def replay(
         warnings = [] if own_camera or detector is not None else _size_warnings(loaded, source)
         if detector is None:
             detector = load_detector_pool(loaded, recorded=not realtime)
-        track_and_decide = TrackAndDecide(
-            loaded,
-            cyclist_box_includes_rider=detector.cyclist_box_includes_rider,
-            ground_mapper=ground_mapper,
-        )
         return asyncio.run(
             _replay(
                 loaded,
                 PacedSource(source) if realtime else source,
-                track_and_decide,
+                TrackAndDecide(loaded, detector.cyclist_box_includes_rider, ground_mapper),
                 detector,
                 files,
                 mqtt and loaded.config.mqtt.enabled,
-                progress,
-                warnings,
+                ReplaySummary(progress or (lambda frames: None), warnings=warnings),
                 pages,
                 serving,
             )
@@ -140,17 +136,16 @@ async def _replay(
     detector: FrameDetector,
     files: ReplayFiles,
     mqtt: bool,
-    progress: Callable[[int], None] | None,
-    warnings: list[str],
+    summary: ReplaySummary,
     pages: Pages | None,
     serving: Callable[[str], None] | None,
 ) -> ReplayResult:
-    summary = ReplaySummary(progress or (lambda frames: None))
     async with contextlib.AsyncExitStack() as stack:
         outputs: list[FrameResultListener] = [summary]
         if files.events is not None:
-            header = new_event_header(loaded, detector)
-            outputs.append(stack.enter_context(EventFile(files.events, header)))
+            events = EventFile(files.events, new_event_header(loaded, detector))
+            stack.callback(events.partial_path.unlink, missing_ok=True)  # no rest after an error
+            outputs.append(stack.enter_context(events))
         if files.overlay is not None:
             fps = source.fps if source.fps > 0 else 30.0
             writer = stack.enter_context(VideoWriter(files.overlay, fps, OVERLAY_SIZE))
@@ -171,7 +166,6 @@ async def _replay(
             feed=RecordedFeed(source),
             source=source.name,
             light=light,
-            light_name="simulated",
             mqtt=mqtt,
             pages=pages,
             outputs=outputs,
@@ -184,29 +178,38 @@ async def _replay(
         if server is not None and serving is not None:
             serving(str(server.address))
         # Logged only now, when nothing can be refused any more: an error is one line on its own.
-        for text in warnings:
+        for text in summary.warnings:
             log.warning("%s", text)
-        loop = application.loop
+        loop, running = application.loop, asyncio.get_running_loop()
+        for number in (signals.SIGTERM, signals.SIGINT):
+            # They end the replay after the current frame, with whole files.
+            with contextlib.suppress(RuntimeError, ValueError):  # in another thread: no signals
+                running.add_signal_handler(number, loop.stop)
+                stack.callback(running.remove_signal_handler, number)
         began = time.perf_counter()
-        with _stop_on_signals(loop):
-            await application.run()
+        await application.run()
         wall_s = time.perf_counter() - began
         if loop.counts.frames == 0:
             raise BikepedError(
                 f"{source.name}: no frame could be read ({loop.counts.undecodable} did not "
                 "decode); check the recording"
             )
-    warnings.extend(_ground_warnings(loaded, summary))
+    if summary.detections >= MIN_DETECTIONS and 2 * summary.not_on_ground > summary.detections:
+        text = (
+            f"{summary.not_on_ground} of {summary.detections} detections end above the horizon or "
+            f"outside the image circle: {loaded.source} is for another camera or mounting; set the "
+            "camera section (projection, fov_deg, radius_px, pitch_deg) to the one that made this"
+        )
+        log.warning("%s", text)
+        summary.warnings.append(text)
     return ReplayResult(
         summary=summary,
         times=application.telemetry.times,
-        frames=loop.counts.frames,
         undecodable=loop.counts.undecodable,
         wall_s=wall_s,
         config_hash=loaded.hash,
         detector=detector.name,
-        warnings=tuple(warnings),
-        interrupted=loop.stopping,
+        interrupted=loop.stopping.is_set(),
     )
 
 
@@ -220,33 +223,3 @@ def _size_warnings(loaded: LoadedConfig, source: FrameSource) -> list[str]:
         "set camera.width, camera.height and its lens"
     )
     return [text]
-
-
-def _ground_warnings(loaded: LoadedConfig, summary: ReplaySummary) -> list[str]:
-    if summary.detections < MIN_DETECTIONS or 2 * summary.not_on_ground <= summary.detections:
-        return []
-    text = (
-        f"{summary.not_on_ground} of {summary.detections} detections end above the horizon or "
-        f"outside the image circle: {loaded.source} is for another camera or mounting; set the "
-        "camera section (projection, fov_deg, radius_px, pitch_deg) to the one that recorded this"
-    )
-    log.warning("%s", text)
-    return [text]
-
-
-@contextlib.contextmanager
-def _stop_on_signals(loop: Loop) -> Iterator[None]:
-    """SIGTERM and Ctrl-C end a replay after the current frame, with whole files."""
-    running = asyncio.get_running_loop()
-    numbers = (signals.SIGTERM, signals.SIGINT)
-    try:
-        for number in numbers:
-            running.add_signal_handler(number, loop.stop)
-    except (RuntimeError, ValueError):  # not the main thread: no signals
-        yield
-        return
-    try:
-        yield
-    finally:
-        for number in numbers:
-            running.remove_signal_handler(number)

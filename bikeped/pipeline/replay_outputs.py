@@ -6,7 +6,6 @@ import asyncio
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any
 
 from bikeped.decision.episodes import EpisodeTracker
@@ -32,6 +31,7 @@ class ReplaySummary:
     not_on_ground: int = 0
     alerts: list[dict[str, Any]] = field(default_factory=list)
     duration_s: float = 0.0
+    warnings: list[str] = field(default_factory=list)
     _episodes: EpisodeTracker = field(default_factory=EpisodeTracker)
 
     async def on_frame_result(self, result: FrameResult) -> None:
@@ -46,34 +46,18 @@ class ReplaySummary:
             self.tracks.setdefault(Kind(kind).label, set()).add(key)
         change = self._episodes.update(decision.state is State.ALERT)
         if change == "begins":
-            self.alerts.append(
-                {
-                    "t": round(result.t_s, 3),
-                    "frame": frame.number,
-                    "sentence": decision.sentence,
-                    "frames": 1,
-                }
-            )
+            alert = {"t": round(result.t_s, 3), "frame": frame.number}
+            self.alerts.append({**alert, "sentence": decision.sentence, "frames": 1})
         elif change == "lasts":
             self.alerts[-1]["frames"] += 1
         self.progress(self.frames)
 
 
 class EventFile(EventWriter):
-    """The event file of a replay; nothing is left of it after an error."""
+    """The event file of a replay."""
 
     async def on_frame_result(self, result: FrameResult) -> None:
         self.write(event_line_for(result))
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        super().__exit__(kind, error, trace)
-        if error is not None:
-            self.partial_path.unlink(missing_ok=True)
 
 
 class OverlayVideo:

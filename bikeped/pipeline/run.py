@@ -63,90 +63,63 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
     )
     provenance = check_provenance(loaded)
     log.log(logging.INFO if provenance.holds else logging.WARNING, "%s", provenance.text)
-    ground_mapper = GroundMapper(loaded)
-    light = light_driver(loaded.config.feedback)
+    config, ground_mapper = loaded.config, GroundMapper(loaded)
+    light = light_driver(config.feedback)
     notifier = Notifier()
-    async with contextlib.AsyncExitStack() as last:
+    async with contextlib.AsyncExitStack() as last, contextlib.AsyncExitStack() as stack:
         last.callback(notifier.close)
         light.start()  # shows FAULT until the first signal
-        # Done last, whatever ends the service.
-        last.push_async_callback(_darken, light)
+        last.push_async_callback(_darken, light)  # done last, whatever ends the service
         if detector is None:
             detector = await _load_while_alive(loaded, light, notifier, stop)
         if detector is None:
             return 0
         log.info("detector: %s, sha256 %s", detector.name, detector.model_hash or "none")
-        track_and_decide = TrackAndDecide(
-            loaded,
-            cyclist_box_includes_rider=detector.cyclist_box_includes_rider,
-            ground_mapper=ground_mapper,
-        )
-        if loaded.config.detection.model == BUNDLED:
+        if config.detection.model == BUNDLED:
             log.warning("detection.model: %s", NOT_FOR_STREETS)
-        async with contextlib.AsyncExitStack() as stack:
-            return await _serve(
-                loaded, track_and_decide, detector, light, notifier, stop, stack, last, pages
-            )
-
-
-async def _serve(
-    loaded: LoadedConfig,
-    track_and_decide: TrackAndDecide,
-    detector: FrameDetector,
-    light: LightDriver,
-    notifier: Notifier,
-    stop: asyncio.Event,
-    stack: contextlib.AsyncExitStack,
-    last: contextlib.AsyncExitStack,
-    pages: Pages | None,
-) -> int:
-    """Starts every part and runs until `stop`; `stack` unwinds before `last`."""
-    config, camera = loaded.config, loaded.config.camera
-    speaker = Speaker(config.feedback.sound, base=loaded.base_dir)
-    stack.push_async_callback(speaker.close)
-    audit = None
-    if config.audit.path is not None:
-        header = new_event_header(loaded, detector)
-        audit = AuditLog(config.audit, header, base_dir=loaded.base_dir)
-        audit.start()
-        stack.push_async_callback(asyncio.to_thread, audit.close)
-    grabber = FrameGrabber(partial(_open_camera, loaded), stale_after_s=camera.stale_after_s)
-    application = Application(
-        loaded,
-        detector,
-        track_and_decide,
-        stack,
-        feed=LiveFeed(grabber),
-        source=camera.source,
-        light=light,
-        light_name=config.feedback.light,
-        mqtt=config.mqtt.enabled,
-        pages=pages,
-        speaker=speaker,
-        audit=audit,
-        limits=Limits(
-            stale_after_s=camera.stale_after_s,
-            silent_after_s=config.detection.silent_after_s,
-            hang_after_s=camera.hang_after_s,
-        ),
-        on_tick=notifier.alive,
-    )
-    grabber.start()
-    await application.serve_pages()
-    stopping = asyncio.create_task(_stop_when(stop, application.loop))
-    notifier.ready(f"watching {camera.source}")
-    try:
-        await application.run()
-    except StageHangError as hang:
-        log.critical("%s; ending so that a fresh process can start", hang)
-        return hang.fault.kind.exit_status or 0
-    finally:
-        notifier.stopping()
-        stopping.cancel()
-        # Stopping the rest may take seconds: keeps the light's watchdog from tripping.
-        last.callback(asyncio.create_task(_refresh(application.dispatcher)).cancel)
-        log.info("latency\n%s", application.telemetry.times.table())
-    return 0
+        speaker = Speaker(config.feedback.sound, base=loaded.base_dir)
+        stack.push_async_callback(speaker.close)
+        audit = None
+        if config.audit.path is not None:
+            header = new_event_header(loaded, detector)
+            audit = AuditLog(config.audit, header, base_dir=loaded.base_dir)
+            audit.start()
+            stack.push_async_callback(asyncio.to_thread, audit.close)
+        stale_after_s = config.camera.stale_after_s
+        grabber = FrameGrabber(partial(_open_camera, loaded), stale_after_s=stale_after_s)
+        application = Application(
+            loaded,
+            detector,
+            TrackAndDecide(loaded, detector.cyclist_box_includes_rider, ground_mapper),
+            stack,
+            feed=LiveFeed(grabber),
+            source=config.camera.source,
+            light=light,
+            mqtt=config.mqtt.enabled,
+            pages=pages,
+            speaker=speaker,
+            audit=audit,
+            limits=Limits(
+                stale_after_s, config.detection.silent_after_s, config.camera.hang_after_s
+            ),
+            on_tick=notifier.alive,
+        )
+        grabber.start()
+        await application.serve_pages()
+        stopping = asyncio.create_task(_stop_when(stop, application.loop))
+        notifier.ready(f"watching {config.camera.source}")
+        try:
+            await application.run()
+        except StageHangError as hang:
+            log.critical("%s; ending so that a fresh process can start", hang)
+            return hang.fault.kind.exit_status or 0
+        finally:
+            notifier.stopping()
+            stopping.cancel()
+            # Stopping the rest may take seconds: keeps the light's watchdog from tripping.
+            last.callback(asyncio.create_task(_refresh(application.dispatcher)).cancel)
+            log.info("latency\n%s", application.telemetry.times.table())
+        return 0
 
 
 def _open_camera(loaded: LoadedConfig) -> FrameSource:

@@ -16,6 +16,8 @@ from typing import Any, ParamSpec, TypeVar
 
 log = logging.getLogger(__name__)
 
+LOG_EVERY_S = 10.0
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -75,18 +77,13 @@ class WorkerThread:
 
 
 class RateLimitedLogger:
-    """Logs at most one line a subject every `every_s` seconds, and how many it suppressed.
+    """Logs at most one line a subject every `LOG_EVERY_S`, and how many it suppressed.
 
     For events that may come thirty times a second for months.
     """
 
-    def __init__(
-        self,
-        log: logging.Logger,
-        every_s: float = 10.0,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._log, self._every_s, self._clock = log, every_s, clock
+    def __init__(self, log: logging.Logger, clock: Callable[[], float] = time.monotonic) -> None:
+        self._log, self._clock = log, clock
         self._logged: dict[str, tuple[float, int]] = {}
 
     def warn(self, subject: str, text: str) -> None:
@@ -104,7 +101,7 @@ class RateLimitedLogger:
     def _due(self, subject: str) -> str | None:
         now_s = self._clock()
         logged_s, suppressed = self._logged.get(subject, (None, 0))
-        if logged_s is not None and now_s - logged_s < self._every_s:
+        if logged_s is not None and now_s - logged_s < LOG_EVERY_S:
             self._logged[subject] = (logged_s, suppressed + 1)
             return None
         self._logged[subject] = (now_s, 0)
@@ -114,8 +111,8 @@ class RateLimitedLogger:
 class Notifier:
     """sd_notify(3): datagrams on $NOTIFY_SOCKET; without a service manager, calls do nothing."""
 
-    def __init__(self, address: str | None = None) -> None:
-        name = address if address is not None else os.environ.get("NOTIFY_SOCKET", "")
+    def __init__(self) -> None:
+        name = os.environ.get("NOTIFY_SOCKET", "")
         # An abstract socket is written with an @ and addressed with a NUL (sd_notify(3)).
         self._address = "\0" + name[1:] if name.startswith("@") else name
         self._socket: socket.socket | None = None
@@ -125,9 +122,6 @@ class Notifier:
 
     def ready(self, status: str) -> None:
         self._send(f"READY=1\nSTATUS={status}")
-
-    def status(self, status: str) -> None:
-        self._send(f"STATUS={status}")
 
     def alive(self) -> None:
         """Feeds the watchdog."""

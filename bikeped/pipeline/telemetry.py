@@ -14,6 +14,7 @@ from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
+from bikeped.feedback import LightDriver
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.runtime import RateLimitedLogger
@@ -56,7 +57,7 @@ class Telemetry:
         wall_clock: Callable[[], float] = time.time,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._loaded, self._track_and_decide = loaded, track_and_decide
+        self.loaded, self._track_and_decide = loaded, track_and_decide
         self._mqtt, self._audit, self._metrics = publisher, audit, metrics
         self._wall, self._clock = wall_clock, clock
         self.times = StageTimes(remember)
@@ -104,11 +105,11 @@ class Telemetry:
         message = state_message(
             decision or Decision(0.0, State.IDLE, sentence),
             since_unix_s=self._wall(),
-            config_hash=self._loaded.hash,
+            config_hash=self.loaded.hash,
             shown=_shown(signal),
             sentence=sentence,
         )
-        self._mqtt.publish("state", encode(message), retain=True, qos=self._loaded.config.mqtt.qos)
+        self._mqtt.publish("state", encode(message), retain=True, qos=self.loaded.config.mqtt.qos)
 
     def fps(self) -> float:
         """Frames processed per second, over the last two seconds."""
@@ -127,7 +128,7 @@ class Telemetry:
             unix_s=self._wall(),
             state=_shown(signal) if signal else "FAULT",
             version=__version__,
-            config_hash=self._loaded.hash,
+            config_hash=self.loaded.hash,
             uptime_s=self._clock() - self._started_s,
             fps=self.fps(),
             latency_ms=self.times.percentiles(),
@@ -144,7 +145,7 @@ class Telemetry:
         return Counters(
             received=counts.received,
             frames=counts.frames,
-            dropped=loop.dropped(),
+            dropped=loop.feed.dropped(),
             undecodable=counts.undecodable,
             failed=counts.failed,
             out_of_order=counts.out_of_order,
@@ -156,7 +157,7 @@ class Telemetry:
     def publish_health(self, message: HealthMessage) -> None:
         """Sends a health message where there is a broker."""
         if self._mqtt is not None:
-            qos = self._loaded.config.mqtt.qos
+            qos = self.loaded.config.mqtt.qos
             self._mqtt.publish("health", encode(message), retain=True, qos=qos)
 
     def measure(self, loop: Loop, light_errors: int = 0) -> None:
@@ -173,7 +174,7 @@ class Telemetry:
 
     def _due(self, now_s: float) -> float:
         """The next due time on a fixed grid, so that 0.1 s means ten a second on average."""
-        interval_s = self._loaded.config.mqtt.publish_interval_s
+        interval_s = self.loaded.config.mqtt.publish_interval_s
         # After a pause no messages are made up for.
         return max(self._next_tracks_s + interval_s, now_s + interval_s / 2)
 
@@ -201,23 +202,18 @@ def _shown(signal: Signal) -> ShownState:
     return cast(ShownState, signal.name)
 
 
-async def report_health(
-    telemetry: Telemetry,
-    loop: Loop,
-    health: Callable[[], HealthMessage],
-    interval_s: float,
-    light_errors: Callable[[], int] = lambda: 0,
-) -> None:
+async def report_health(telemetry: Telemetry, loop: Loop, light: LightDriver) -> None:
     """Reports health to broker, metrics and log until cancelled. An error costs one report."""
     limited_log = RateLimitedLogger(log)
+    interval_s = telemetry.loaded.config.mqtt.health_interval_s
     next_health_s = next_log_s = -math.inf
     while True:
         try:
             now_s = time.monotonic()
-            telemetry.measure(loop, light_errors())
+            telemetry.measure(loop, light.errors)
             if now_s >= next_health_s:
                 next_health_s = now_s + interval_s
-                message = health()
+                message = telemetry.health(loop, light.name)
                 telemetry.publish_health(message)
                 if now_s >= next_log_s and message.latency_ms:
                     next_log_s = now_s + LOG_EVERY_S

@@ -74,7 +74,6 @@ class TrackAndDecide:
     def __init__(
         self,
         loaded: LoadedConfig,
-        *,
         cyclist_box_includes_rider: bool = False,
         ground_mapper: GroundMapper | None = None,
     ) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from bikeped.config import AuditConfig
+from bikeped.faults import Fault
 from bikeped.telemetry.builders import encode_line
 from bikeped.telemetry.schema import EventHeader, EventLine
 
@@ -60,7 +61,7 @@ class AuditLog:
         self._dropped = 0
         self._written = 0
         self._closing = False
-        self._fault: str | None = None
+        self._fault: Fault | None = None
         self._thread: threading.Thread | None = None
 
         # Only the thread touches these.
@@ -69,8 +70,8 @@ class AuditLog:
         self._synced_s = 0.0
 
     @property
-    def fault(self) -> str | None:
-        """Why nothing can be written, one line with the remedy; None while it can."""
+    def fault(self) -> Fault | None:
+        """Why nothing can be written, with the remedy; None while it can."""
         return self._fault
 
     @property
@@ -137,12 +138,13 @@ class AuditLog:
         self._queue.extendleft(reversed(kept))
 
     def _log_fault_change(self, error: str | None) -> None:
-        if error != self._fault:
-            if error is None:
+        fault = None if error is None else Fault("audit", "audit.error", error)
+        if fault != self._fault:
+            if fault is None:
                 log.info("audit: writing again")
             else:
-                log.error("audit: %s", error)
-        self._fault = error
+                log.error("%s", fault)
+        self._fault = fault
 
     def _append(self, lines: list[bytes], *, sync: bool) -> tuple[int, str | None]:
         """Writes `lines`; returns how many were written, and the error that stopped the rest."""

@@ -127,6 +127,8 @@ class FakeDetector:
 class FakeLight:
     """What `LightDriver.show` was called with."""
 
+    name, errors = "simulated", 0
+
     def __init__(self) -> None:
         self.shown: list[Signal] = []
 

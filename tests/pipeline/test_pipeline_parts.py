@@ -172,11 +172,13 @@ def test_a_damaged_jpeg_is_a_picture_or_refused(small_jpegs, data):
     assert picture.rgb.ndim == 3
 
 
-def test_without_a_service_manager_nothing_is_sent_and_nothing_fails():
-    notifier = Notifier("")
+def test_without_a_service_manager_nothing_is_sent_and_nothing_fails(monkeypatch):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    notifier = Notifier()
     notifier.ready("up")
     notifier.alive()
     notifier.close()
-    gone = Notifier("/nowhere/notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere/notify")
+    gone = Notifier()
     gone.alive()
     gone.close()

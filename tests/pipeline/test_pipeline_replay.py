@@ -139,7 +139,7 @@ def test_a_scaled_copy_is_said_once_with_the_remedy(make_clip, small_config, cap
     assert len(said) == 1
     assert "96 x 64" in said[0]
     assert "set camera.width" in said[0]
-    assert result.warnings == tuple(said)
+    assert result.summary.warnings == said
     assert result.as_dict()["tracks"] == {"pedestrian": 1}  # the scale is right all the same
 
 
@@ -149,14 +149,15 @@ def test_detections_in_the_sky_mean_wrong_camera_settings(make_clip, small_confi
     with caplog.at_level(logging.WARNING):
         result = replay(loaded, str(clip))
     assert result.as_dict()["not_on_ground"] == 25
-    assert "pitch_deg" in result.warnings[0]
+    assert "pitch_deg" in result.summary.warnings[0]
     assert caplog.text.count("25 of 25 detections") == 1
 
 
 def test_a_few_in_the_sky_mean_nothing(make_clip, small_config):
     clip = make_clip("c.avi", 25)
     detector = FakeDetector(seen((Kind.PEDESTRIAN, 48, 40), (Kind.PEDESTRIAN, 40, 45)))
-    assert replay(load_config(small_config(clip)), str(clip), detector=detector).warnings == ()
+    result = replay(load_config(small_config(clip)), str(clip), detector=detector)
+    assert result.summary.warnings == []
 
 
 def test_the_lamps_of_the_crossing_are_not_touched(make_clip, small_config, caplog):

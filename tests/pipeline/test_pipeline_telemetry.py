@@ -252,20 +252,22 @@ async def test_every_lost_frame_is_in_health_metrics_and_log_line():
         assert "bikeped_frames_out_of_order_total 1.0" in text
 
 
-async def test_a_failing_health_report_costs_a_message_and_no_more(caplog):
+async def test_a_failing_health_report_costs_a_message_and_no_more(caplog, monkeypatch):
     import asyncio
 
-    rig = TelemetryRig()
+    rig = TelemetryRig(config=small("mqtt.health_interval_s=0.1"))
     async with rig:
-        calls = asyncio.Queue()
+        calls = []
+        health = rig.telemetry.health
 
-        def health():
-            calls.put_nowait(1)
-            if calls.qsize() == 1:
+        def health_with_a_bug(loop, light):
+            calls.append(1)
+            if len(calls) == 1:
                 raise ValueError("a bug")
-            return rig.telemetry.health(rig.loop, "simulated")
+            return health(loop, light)
 
-        telling = asyncio.create_task(report_health(rig.telemetry, rig.loop, health, 0.01))
+        monkeypatch.setattr(rig.telemetry, "health", health_with_a_bug)
+        telling = asyncio.create_task(report_health(rig.telemetry, rig.loop, rig.light))
         try:
             while not rig.publisher.of("health"):
                 assert not telling.done()
