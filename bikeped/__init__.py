@@ -1,3 +1,3 @@
 """bikeped: warns cyclists and pedestrians at a crossing of one another."""
 
-__version__ = "0.1.0"
+__version__ = "0.1.1"
