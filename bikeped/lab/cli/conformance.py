@@ -54,8 +54,10 @@ def command() -> None:
     help="Write every frame's true and observed positions, state and danger as JSON Lines.",
 )
 def run(run: SuiteRun, name: str | None, audit_path: Path | None) -> None:
-    """Results of every scenario under one configuration: states, sensitivity, specificity, warning
-    budget."""
+    """Results of every scenario under one configuration.
+
+    States, sensitivity, specificity, missed severity, fatigue, latency and warning budgets.
+    """
     from bikeped.lab.experiments.deterministic import run_table, select_scenario
     from bikeped.lab.governance.audit_records import write_audit
 
@@ -76,7 +78,10 @@ def run(run: SuiteRun, name: str | None, audit_path: Path | None) -> None:
     help="A further configuration: the file's decision section. May be repeated.",
 )
 def compare(run: SuiteRun, added: tuple[str, ...]) -> None:
-    """Compare decision rules and configurations, with and without localisation error."""
+    """Compare decision rules and configurations.
+
+    Each with and without localisation error.
+    """
     from bikeped.lab.experiments.deterministic import compare_table
     from bikeped.lab.simulation.suite import CONFIGURATIONS
 
@@ -103,7 +108,7 @@ def errors(run: SuiteRun) -> None:
 @command.command("truth")
 @experiment_options
 def truth(run: SuiteRun) -> None:
-    """Sensitivity to the ground-truth thresholds and to the cyclists' braking profile."""
+    """Sensitivity to ground-truth thresholds and braking profiles."""
     from bikeped.lab.experiments.deterministic import braking_profiles, truth_sensitivity
     from bikeped.lab.result_tables import ExperimentResult
 
@@ -122,10 +127,10 @@ def truth(run: SuiteRun) -> None:
 def montecarlo(
     run: SuiteRun, trials: int, burst: float, curve_path: Path | None, processes: int
 ) -> None:
-    """Monte Carlo with missed detections, independent and in bursts: means with 95 % confidence
-    intervals.
+    """Monte Carlo trials with missed detections.
 
-    The configuration's own decision is `configured` when it is none of the named ones.
+    Misses are independent or in bursts; results are means with 95 % confidence intervals. The
+    configuration's own decision is `configured` when it is none of the named ones.
     """
     require("scipy")
     from bikeped.lab.experiments import montecarlo as mc
@@ -275,7 +280,10 @@ def reproduce(
     processes: int,
     no_figures: bool,
 ) -> None:
-    """Run all experiments with every table and figure; resumes after an interruption."""
+    """Run all experiments, with every table and figure.
+
+    Finished experiments are kept: a second run resumes after an interruption.
+    """
     require("scipy")  # before the work, not in the middle of it
     from bikeped.lab.experiments import reproduce as reproduction
     from bikeped.lab.experiments.deterministic import METRIC_COLUMNS

@@ -1,4 +1,4 @@
-"""Drawn scenarios through the deployed loop, and the ladder from the scripted run to it."""
+"""Drawn scenarios through the deployed loop, and the ablation from the scripted run to it."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_the_loop_and_the_ablation_decide_alike(
     np.testing.assert_array_equal(again, run.state)
 
 
-def test_measures_of_a_perfect_eye(
+def test_measures_of_a_perfect_detector(
     run: EndToEndRun, scenario: Scenario, loaded: LoadedConfig
 ) -> None:
     suite = Suite.load([scenario], loaded)

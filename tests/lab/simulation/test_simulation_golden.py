@@ -1,9 +1,9 @@
 """Every decision of the selected configuration on the 24, written down: a change is a diff.
 
-`python tests/conformance/test_conformance_golden.py` writes tests/conformance/golden/ anew. One
-file a scenario, one line per stretch of frames with the same state and pair: when it begins, how
-many frames it lasts, the state, and in ALERT and WARNING the deciding pair (tracks, in the order
-of their birth) with its distance at the first and last frame of the stretch.
+`python tests/lab/simulation/test_simulation_golden.py` writes tests/lab/simulation/golden/ anew.
+One file a scenario, one line per stretch of frames with the same state and pair: when it begins,
+how many frames it lasts, the state, and in ALERT and WARNING the deciding pair (tracks, in the
+order of their birth) with its distance at the first and last frame of the stretch.
 """
 
 import sys
@@ -23,7 +23,7 @@ from bikeped.types import GroundPoints
 HERE = Path(__file__).parent
 GOLDEN = HERE / "golden"
 FILES = {p.stem: p for p in sorted(bundled_folder().glob("*.yaml"))}
-MEND = "if the change is meant: python tests/conformance/test_conformance_golden.py"
+REMEDY = "if the change is meant: python tests/lab/simulation/test_simulation_golden.py"
 
 
 def trace(name, scene):
@@ -59,7 +59,7 @@ def trace(name, scene):
 def test_decisions_are_as_written_down(suite, slug):
     index = [Path(s.source).stem for s in suite.scenarios].index(slug)
     found = trace(suite.names[index], suite.detection_sequences()[index])
-    assert found == (GOLDEN / f"{slug}.txt").read_text(encoding="utf-8"), MEND
+    assert found == (GOLDEN / f"{slug}.txt").read_text(encoding="utf-8"), REMEDY
 
 
 def test_there_is_a_trace_for_every_scenario_and_no_other():
