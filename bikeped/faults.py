@@ -13,6 +13,7 @@ import logging
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -54,31 +55,21 @@ class FaultKind:
 
     code: str  #: component and cause, as `camera.no_frame`; programs may rely on it
     component: Component  #: whose health it belongs to
+    meaning: str  #: one plain sentence for people
     effect: Effect
     severity: Severity
     clears: Clears
-    meaning: str  #: one plain sentence for people
     exit_status: int | None = None  #: of the process, where the fault ends it
 
 
-def _stops(
-    code: str, component: Component, meaning: str, severity: Severity = Severity.ERROR
-) -> FaultKind:
-    """The light shows FAULT until good frames come again."""
-    return FaultKind(code, component, Effect.FAULT, severity, Clears.GOOD_FRAMES, meaning)
-
-
-def _ends(code: str, component: Component, meaning: str) -> FaultKind:
-    """Only a new process helps: the light shows FAULT and the service ends."""
-    return FaultKind(
-        code, component, Effect.FAULT, Severity.CRITICAL, Clears.RESTART, meaning, EXIT_RESTART
-    )
-
-
-def _notice(code: str, component: Component, severity: Severity, meaning: str) -> FaultKind:
-    """Reported, while the light goes on showing the decision."""
-    return FaultKind(code, component, Effect.NOTICE, severity, Clears.AT_ONCE, meaning)
-
+#: The light shows FAULT until good frames come again.
+_stops = partial(FaultKind, effect=Effect.FAULT, severity=Severity.ERROR, clears=Clears.GOOD_FRAMES)
+_begins = partial(_stops, severity=Severity.INFO)
+#: Only a new process helps: the light shows FAULT and the service ends.
+_ends = partial(_stops, severity=Severity.CRITICAL, clears=Clears.RESTART, exit_status=EXIT_RESTART)
+#: Reported, while the light goes on showing the decision.
+_notice = partial(FaultKind, effect=Effect.NOTICE, severity=Severity.ERROR, clears=Clears.AT_ONCE)
+_minor = partial(_notice, severity=Severity.WARNING)
 
 FAULT_KINDS: dict[str, FaultKind] = {
     kind.code: kind
@@ -94,38 +85,25 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _stops("detector.error", "detector", "The detector fails on every frame."),
         _ends("detector.hang", "detector", "Inference has not returned for camera.hang_after_s."),
         _ends("detector.failing", "detector", "Only failures for camera.hang_after_s."),
+        _begins("service.starting", "service", "The model loads, or the first frames are due."),
+        _begins("service.recovering", "service", "A fault is over; good frames are counted."),
         _stops(
-            "service.starting",
-            "service",
-            "The model loads, or the first frames are due.",
-            Severity.INFO,
-        ),
-        _stops(
-            "service.recovering",
-            "service",
-            "A fault is over; good frames are counted.",
-            Severity.INFO,
-        ),
-        FaultKind(
             "light.not_refreshed",
             "light",
-            Effect.FAULT,
-            Severity.ERROR,
-            Clears.AT_ONCE,
             "The service has not set the light for a second; its thread shows FAULT by itself.",
+            clears=Clears.AT_ONCE,
         ),
-        _notice("light.error", "light", Severity.ERROR, "The light cannot be opened or set."),
-        _notice("light.hang", "light", Severity.ERROR, "The light's device does not answer."),
-        FaultKind(
+        _notice("light.error", "light", "The light cannot be opened or set."),
+        _notice("light.hang", "light", "The light's device does not answer."),
+        _notice(
             "light.thread_ended",
             "light",
-            Effect.NOTICE,
-            Severity.CRITICAL,
-            Clears.RESTART,
             "The light's thread has ended.",
+            severity=Severity.CRITICAL,
+            clears=Clears.RESTART,
         ),
-        _notice("speaker.error", "speaker", Severity.WARNING, "A sound could not be played."),
-        _notice("audit.error", "audit", Severity.WARNING, "The audit log cannot be written."),
+        _minor("speaker.error", "speaker", "A sound could not be played."),
+        _minor("audit.error", "audit", "The audit log cannot be written."),
     )
 }
 

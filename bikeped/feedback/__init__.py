@@ -7,31 +7,11 @@ and `SimulatedLight` are devices; `speaker` plays the sounds of `sounds`.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
+from bikeped.config import FeedbackConfig
 from bikeped.feedback.gpio import GpioLight, gpio_lamps
 from bikeped.feedback.light import Light, LightDriver, SimulatedLight
-from bikeped.feedback.signal_logic import OFF, SignalLogic, fault_signal
-from bikeped.feedback.speaker import Speaker
 from bikeped.feedback.usb import UsbLight, relay_lamps
-
-if TYPE_CHECKING:
-    from bikeped.config import FeedbackConfig
-
-__all__ = [
-    "OFF",
-    "GpioLight",
-    "Light",
-    "LightDriver",
-    "SignalLogic",
-    "SimulatedLight",
-    "Speaker",
-    "UsbLight",
-    "check_light",
-    "fault_signal",
-    "light_driver",
-    "open_light",
-]
 
 
 def check_light(config: FeedbackConfig) -> None:

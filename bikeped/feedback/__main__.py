@@ -33,18 +33,15 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("usage: python -m bikeped.feedback CONFIG\n")
         return 2
     try:
-        open_light(_read(Path(arguments[0]))).close()
+        data = Path(arguments[0]).read_bytes()
+        open_light(msgspec.yaml.decode(data, type=_FeedbackOnly).feedback).close()
     except BikepedError as error:
         sys.stderr.write(f"{error}\n")
         return error.exit_status
-    return 0
-
-
-def _read(path: Path) -> FeedbackConfig:
-    try:
-        return msgspec.yaml.decode(path.read_bytes(), type=_FeedbackOnly).feedback
     except (OSError, msgspec.DecodeError) as error:
-        raise ConfigError(f"{path}: {error}") from error
+        sys.stderr.write(f"{arguments[0]}: {error}\n")
+        return ConfigError.exit_status
+    return 0
 
 
 if __name__ == "__main__":

@@ -11,14 +11,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from bikeped.config import GpioConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback.light import Lamp, assign_lamps
 from bikeped.types import Colour
-
-if TYPE_CHECKING:
-    from bikeped.config import GpioConfig
 
 SECTION = "feedback.gpio"
 

@@ -96,12 +96,14 @@ def assign_lamps(wired: Mapping[Colour, Lamp], section: str) -> dict[Colour, Lam
 class LightDriver:
     """Shows signals on a light, from its own thread, and reports when the light does not obey.
 
-    `open_light` opens the device, in the thread, at the start and after every error, with pauses
-    that double from `retry_s[0]` to `retry_s[1]` seconds; `name` is its kind, as in
-    `feedback.light`. Without a `show` for `watchdog_s` the light shows FAULT. A device call longer
-    than `hang_s` is a fault. An unchanged colour is sent again every `assert_s`, so that an
-    unplugged or replugged light is noticed. A newer signal replaces one that was not shown yet.
+    `open_light` opens the device, in the thread, at the start and after every error; `name` is its
+    kind, as in `feedback.light`. Without a `show` for `watchdog_s` the light shows FAULT. A newer
+    signal replaces one that was not shown yet.
     """
+
+    hang_s = 2.0  #: a device call longer than this is a fault
+    assert_s = 2.0  #: between two sendings of an unchanged colour: a replugged light is noticed
+    retry_s = (0.5, 30.0)  #: first and longest pause after an error; pauses double
 
     def __init__(
         self,
@@ -110,18 +112,12 @@ class LightDriver:
         name: str = "simulated",
         fault_blink_hz: float = 0.5,
         watchdog_s: float = 1.0,
-        hang_s: float = 2.0,
-        assert_s: float = 2.0,
-        retry_s: tuple[float, float] = (0.5, 30.0),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = name
         self._open_light = open_light
         self._watchdog_signal = fault_signal((NOT_REFRESHED,), fault_blink_hz)
         self._watchdog_s = watchdog_s
-        self._hang_s = hang_s
-        self._assert_s = assert_s
-        self._retry_s = retry_s
         self._clock = clock
 
         # Shared with the caller, guarded by the condition's lock.
@@ -131,7 +127,7 @@ class LightDriver:
         self._closing = False
         self._busy_since: float | None = None
         self._error: Fault | None = None
-        self._errors = 0
+        self.errors = 0  #: device calls that failed, since the start
 
         # The thread's own.
         self._light: Light | None = None
@@ -140,7 +136,7 @@ class LightDriver:
         self._pattern: tuple[Colour, float] = (Colour.OFF, 0.0)
         self._pattern_s = 0.0
         self._retry_at_s: float | None = None
-        self._pause_s = retry_s[0]
+        self._pause_s = self.retry_s[0]
         self._tripped = False
         self._thread: threading.Thread | None = None
 
@@ -167,17 +163,12 @@ class LightDriver:
         """What is wrong with the light now, for health and the log; None when it obeys."""
         with self._changed:
             if self._thread is not None and not self._thread.is_alive() and not self._closing:
-                return _fault("light.thread_ended", "its thread has ended; restart the service")
-            if self._busy_since is not None and self._clock() - self._busy_since > self._hang_s:
-                return _fault(
-                    "light.hang", f"the device has not answered for more than {self._hang_s:g} s"
-                )
+                detail = "its thread has ended; restart the service"
+                return Fault("light", "light.thread_ended", detail)
+            if self._busy_since is not None and self._clock() - self._busy_since > self.hang_s:
+                detail = f"the device has not answered for more than {self.hang_s:g} s"
+                return Fault("light", "light.hang", detail)
             return self._error
-
-    @property
-    def errors(self) -> int:
-        """Device calls that failed, since the start."""
-        return self._errors
 
     def close(self, timeout_s: float = 2.0) -> bool:
         """Switches the light off and ends the thread; False when the device hangs.
@@ -202,8 +193,7 @@ class LightDriver:
             self._pattern = _pattern_of(signal)
             self._pattern_s = now_s
         colour, edge_s = _phase(self._pattern, self._pattern_s, now_s)
-        wake_s = [edge_s, trips_at_s, self._apply(colour, now_s)]
-        return min(wake_s)
+        return min(edge_s, trips_at_s, self._apply(colour, now_s))
 
     def _effective(self, now_s: float) -> tuple[Signal, float]:
         """The signal that counts at `now_s`, and when the watchdog would trip."""
@@ -224,8 +214,8 @@ class LightDriver:
         """Makes the device show `colour`, if it does not already; returns when to check again."""
         if self._retry_at_s is not None and now_s < self._retry_at_s:
             return self._retry_at_s
-        if colour == self._applied and 0 <= now_s - self._applied_s < self._assert_s:
-            return self._applied_s + self._assert_s
+        if colour == self._applied and 0 <= now_s - self._applied_s < self.assert_s:
+            return self._applied_s + self.assert_s
         try:
             if self._light is None:
                 self._light = self._call(self._open_light)
@@ -236,9 +226,13 @@ class LightDriver:
         except Exception as error:  # noqa: BLE001 - a bug must not end the watchdog's thread
             _log.debug("light: unexpected error", exc_info=True)
             return self._failed(f"{type(error).__name__}: {error}", now_s)
-        self._succeeded()
+        self._retry_at_s, self._pause_s = None, self.retry_s[0]
+        if self._error is not None:
+            _log.warning("light: works again")
+            with self._changed:
+                self._error = None
         self._applied, self._applied_s = colour, now_s
-        return now_s + self._assert_s
+        return now_s + self.assert_s
 
     def _call(self, action: Callable[[], _T]) -> _T:
         with self._changed:
@@ -249,25 +243,17 @@ class LightDriver:
             with self._changed:
                 self._busy_since = None
 
-    def _succeeded(self) -> None:
-        self._retry_at_s = None
-        self._pause_s = self._retry_s[0]
-        if self._error is not None:
-            _log.warning("light: works again")
-            with self._changed:
-                self._error = None
-
     def _failed(self, detail: str, now_s: float) -> float:
-        fault = _fault("light.error", detail)
+        fault = Fault("light", "light.error", detail)
         with self._changed:
             known, self._error = self._error, fault
-            self._errors += 1
+            self.errors += 1
         if fault != known:
             _log.error("%s", fault)
         self._release()
         self._applied = None
         self._retry_at_s = now_s + self._pause_s
-        self._pause_s = min(2 * self._pause_s, self._retry_s[1])
+        self._pause_s = min(2 * self._pause_s, self.retry_s[1])
         return self._retry_at_s
 
     def _release(self) -> None:
@@ -305,10 +291,6 @@ class LightDriver:
         if signal is None or self._clock() - self._shown_s >= self._watchdog_s:
             signal = self._watchdog_signal
         return _pattern_of(signal) != self._pattern
-
-
-def _fault(code: str, detail: str) -> Fault:
-    return Fault("light", code, detail)
 
 
 def _pattern_of(signal: Signal) -> tuple[Colour, float]:

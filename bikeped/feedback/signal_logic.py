@@ -27,13 +27,9 @@ The machine counts good frames: new decisions without a fault, in a row. It star
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from bikeped.config import FeedbackConfig
 from bikeped.faults import Fault
 from bikeped.types import Colour, Signal, Sound, State
-
-if TYPE_CHECKING:
-    from bikeped.config import FeedbackConfig
 
 #: The fault shown before the first `recover_frames` good frames.
 STARTING = Fault("starting", "service.starting", "not enough good frames yet")

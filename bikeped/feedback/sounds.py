@@ -50,18 +50,12 @@ _FADE_S = 0.03
 
 def chime() -> FloatArray:
     """The chime at `RATE_HZ`, samples in -1..1, peak 1."""
-    out = np.zeros(round(_CHIME_S * RATE_HZ))
-    for index, note_hz in enumerate(_CHIME_NOTES_HZ):
-        _add(out, index * _CHIME_SPACING_S, note_hz, _CHIME_PARTIALS)
-    return _finish(out)
+    return _struck(_CHIME_NOTES_HZ, _CHIME_PARTIALS, _CHIME_SPACING_S, _CHIME_S)
 
 
 def bell() -> FloatArray:
     """The bell, struck twice, at `RATE_HZ`, samples in -1..1, peak 1."""
-    out = np.zeros(round(_BELL_S * RATE_HZ))
-    for strike in range(2):
-        _add(out, strike * _BELL_SPACING_S, _BELL_PRIME_HZ, _BELL_PARTIALS)
-    return _finish(out)
+    return _struck((_BELL_PRIME_HZ,) * 2, _BELL_PARTIALS, _BELL_SPACING_S, _BELL_S)
 
 
 def make_wav(sound: Sound, volume: float) -> bytes:
@@ -129,24 +123,22 @@ def _checked(volume: float) -> float:
     return volume
 
 
-def _add(
-    out: FloatArray,
-    start_s: float,
-    base_hz: float,
+def _struck(
+    notes_hz: tuple[float, ...],
     partials: tuple[tuple[float, float, float], ...],
-) -> None:
-    """Adds one struck note to `out`, from `start_s` to its end."""
-    start = round(start_s * RATE_HZ)
-    t = np.arange(out.size - start) / RATE_HZ
-    # A few milliseconds of attack: a step at the start would click.
-    attack = np.minimum(t / _ATTACK_S, 1.0)
-    for ratio, amplitude, decay_s in partials:
-        wave_form = np.sin(2 * np.pi * base_hz * ratio * t)
-        out[start:] += amplitude * np.exp(-t / decay_s) * attack * wave_form
-
-
-def _finish(out: FloatArray) -> FloatArray:
-    """Fades the end out and scales the peak to 1."""
+    spacing_s: float,
+    length_s: float,
+) -> FloatArray:
+    """Notes struck `spacing_s` apart, each ringing to the end, which fades out; peak 1."""
+    out = np.zeros(round(length_s * RATE_HZ))
+    for index, note_hz in enumerate(notes_hz):
+        start = round(index * spacing_s * RATE_HZ)
+        t = np.arange(out.size - start) / RATE_HZ
+        # A few milliseconds of attack: a step at the start would click.
+        attack = np.minimum(t / _ATTACK_S, 1.0)
+        for ratio, amplitude, decay_s in partials:
+            wave_form = np.sin(2 * np.pi * note_hz * ratio * t)
+            out[start:] += amplitude * np.exp(-t / decay_s) * attack * wave_form
     fade = round(_FADE_S * RATE_HZ)
     out[-fade:] *= np.linspace(1.0, 0.0, fade)
     scaled: FloatArray = out / float(np.abs(out).max())

@@ -14,16 +14,16 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
+from bikeped.config import SoundConfig
 from bikeped.faults import Fault
 from bikeped.feedback.sounds import duration_s, load_wav, make_wav
 from bikeped.types import Sound
 
-if TYPE_CHECKING:
-    from bikeped.config import SoundConfig
-
 _log = logging.getLogger(__name__)
+
+RETRY_S = 2.0  #: the shortest pause after a failure
 
 
 class Speaker:
@@ -35,7 +35,7 @@ class Speaker:
     its cool-down.
 
     `base` is the folder that relative WAV paths of the configuration start from. `grace_s`: how
-    much longer than the sound a child may live. `retry_s`: the shortest pause after a failure.
+    much longer than the sound a child may live. `fault` says why the last sound was not heard.
     Raises FeedbackError when a configured WAV file is unusable.
     """
 
@@ -44,35 +44,30 @@ class Speaker:
         config: SoundConfig,
         *,
         base: Path | None = None,
-        program: str = "aplay",
         grace_s: float = 3.0,
-        retry_s: float = 2.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._enabled = config.enabled
-        self._command = (program, "-q", "-D", config.device)
+        self._command = ("aplay", "-q", "-D", config.device)
         self._cooldown_s = {
             Sound.CHIME: config.chime_cooldown_s,
             Sound.BELL: config.bell_cooldown_s,
         }
-        self._grace_s = grace_s
-        self._retry_s = retry_s
-        self._clock = clock
+        self._grace_s, self._clock = grace_s, clock
         self._wavs: dict[Sound, bytes] = {}
         if config.enabled:
             for sound, name in ((Sound.CHIME, config.chime), (Sound.BELL, config.bell)):
-                self._wavs[sound] = _wav(sound, name, config.volume, base)
+                if name is None:
+                    self._wavs[sound] = make_wav(sound, config.volume)
+                else:
+                    path, key = Path(name).expanduser(), f"feedback.sound.{sound.value}"
+                    self._wavs[sound] = load_wav((base or Path()) / path, key, config.volume)
         self._ready_s = {Sound.CHIME: float("-inf"), Sound.BELL: float("-inf")}
         self._task: asyncio.Task[None] | None = None
         # The interrupted ones too, until their children have gone.
         self._tasks: set[asyncio.Task[None]] = set()
         self._playing = Sound.NONE
-        self._fault: Fault | None = None
-
-    @property
-    def fault(self) -> Fault | None:
-        """Why the last sound was not heard; None when it was, or none was asked for."""
-        return self._fault
+        self.fault: Fault | None = None
 
     @property
     def playing(self) -> Sound:
@@ -120,16 +115,16 @@ class Speaker:
             await asyncio.wait({before})
         error = await self._play(self._wavs[sound])
         if error is None:
-            if self._fault is not None:
+            if self.fault is not None:
                 _log.warning("speaker: works again")
-            self._fault = None
+            self.fault = None
             return
         fault = Fault("speaker", "speaker.error", error)
-        if fault != self._fault:
+        if fault != self.fault:
             _log.log(fault.kind.severity, "%s", fault)
-        self._fault = fault
+        self.fault = fault
         # A broken card must not cost a process thirty times a second, whatever the cool-down.
-        self._ready_s[sound] = max(self._ready_s[sound], self._clock() + self._retry_s)
+        self._ready_s[sound] = max(self._ready_s[sound], self._clock() + RETRY_S)
 
     async def _play(self, wav: bytes) -> str | None:
         """Plays one WAV file; returns what went wrong, or None."""
@@ -175,10 +170,3 @@ async def _end(child: asyncio.subprocess.Process) -> None:
             signal_it()
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(child.wait(), patience_s)
-
-
-def _wav(sound: Sound, name: str | None, volume: float, base: Path | None) -> bytes:
-    if name is None:
-        return make_wav(sound, volume)
-    path = Path(name).expanduser()
-    return load_wav((base or Path()) / path, f"feedback.sound.{sound.value}", volume)

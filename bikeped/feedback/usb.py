@@ -22,14 +22,12 @@ import contextlib
 import errno
 import importlib
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from bikeped.config import UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback.light import Lamp, assign_lamps
 from bikeped.types import Colour
-
-if TYPE_CHECKING:
-    from bikeped.config import UsbConfig
 
 SECTION = "feedback.usb"
 TIMEOUT_MS = 300
@@ -80,7 +78,8 @@ class UsbLight:
         with self._errors("cannot be opened"):
             self._device = self._find(config, backend)
             try:
-                self._claim()
+                _detach(self._device)
+                self._util.claim_interface(self._device, _INTERFACE)
                 self._show = self._protocol(config, lamps)
             except BaseException:
                 self._util.dispose_resources(self._device)
@@ -129,10 +128,6 @@ class UsbLight:
         _detach(device)
         report = _get_feature(device, 0, 8)
         return bytes(report[:5]).rstrip(b"\0").decode("ascii", "replace")
-
-    def _claim(self) -> None:
-        _detach(self._device)
-        self._util.claim_interface(self._device, _INTERFACE)
 
     def _protocol(self, config: UsbConfig, lamps: dict[Colour, Lamp]) -> Callable[[Colour], object]:
         """What shows a colour on this kind of device."""

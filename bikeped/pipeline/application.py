@@ -18,7 +18,9 @@ from bikeped.config import LoadedConfig, road_region
 from bikeped.cores import cores
 from bikeped.detection.load import load_detector
 from bikeped.errors import DetectorError
-from bikeped.feedback import LightDriver, SignalLogic, Speaker
+from bikeped.feedback.light import LightDriver
+from bikeped.feedback.signal_logic import SignalLogic
+from bikeped.feedback.speaker import Speaker
 from bikeped.pipeline.detection_stage import (
     MAX_INFLIGHT,
     DetectionStage,

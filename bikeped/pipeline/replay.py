@@ -15,7 +15,7 @@ from typing import Any
 from bikeped.capture import FrameSource, PacedSource
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
-from bikeped.feedback import LightDriver, SimulatedLight
+from bikeped.feedback.light import LightDriver, SimulatedLight
 from bikeped.overlay import VideoWriter
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector

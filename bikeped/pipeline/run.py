@@ -16,7 +16,10 @@ from bikeped.capture import FrameGrabber, FrameSource, PacedSource
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
-from bikeped.feedback import LightDriver, Speaker, fault_signal, light_driver
+from bikeped.feedback import light_driver
+from bikeped.feedback.light import LightDriver
+from bikeped.feedback.signal_logic import fault_signal
+from bikeped.feedback.speaker import Speaker
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector

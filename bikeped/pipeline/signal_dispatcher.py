@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from bikeped.faults import Fault, fault_texts
-from bikeped.feedback import OFF, LightDriver, SignalLogic, Speaker
+from bikeped.feedback.light import LightDriver
+from bikeped.feedback.signal_logic import OFF, SignalLogic
+from bikeped.feedback.speaker import Speaker
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.types import Decision, Signal
 

@@ -14,7 +14,7 @@ from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
-from bikeped.feedback import LightDriver
+from bikeped.feedback.light import LightDriver
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.runtime import RateLimitedLogger

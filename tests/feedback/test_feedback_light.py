@@ -67,13 +67,16 @@ class FakeLight:
 
 def make(light: FakeLight | None = None, **settings: float) -> tuple[LightDriver, FakeLight, Clock]:
     light, clock = light or FakeLight(), Clock()
-    driver = LightDriver(
-        light.open,
-        fault_blink_hz=FAULT_HZ,
-        clock=clock,
-        **settings,  # type: ignore[arg-type]
+    watchdog_s = settings.pop("watchdog_s", 1.0)
+    driver = tuned(**settings)(
+        light.open, fault_blink_hz=FAULT_HZ, watchdog_s=watchdog_s, clock=clock
     )
     return driver, light, clock
+
+
+def tuned(**settings: object) -> type[LightDriver]:
+    """The driver with other times."""
+    return type("Tuned", (LightDriver,), settings)
 
 
 def run(driver: LightDriver, clock: Clock, until_s: float, signal: Signal | None) -> None:
@@ -216,7 +219,7 @@ def test_a_hanging_device_blocks_nobody_and_is_a_fault() -> None:
             release.wait(WAIT_S)
 
     clock = Clock()
-    driver = LightDriver(Hanging().open, hang_s=2.0, clock=clock)
+    driver = LightDriver(Hanging().open, clock=clock)
     driver.start()
     assert entered.wait(WAIT_S)
     driver.show(GREEN)
@@ -241,7 +244,7 @@ def test_closing_tries_once_more_to_darken_a_light_that_failed() -> None:
     handler = Tells(logging.ERROR)
     logging.getLogger("bikeped.feedback.light").addHandler(handler)
     try:
-        driver = LightDriver(light.open, retry_s=(600.0, 600.0))
+        driver = tuned(retry_s=(600.0, 600.0))(light.open)
         driver.start()
         assert failed.wait(WAIT_S)
     finally:

@@ -12,7 +12,7 @@ from prometheus_client import generate_latest
 
 from bikeped.errors import DetectorError
 from bikeped.faults import FAULT_KINDS, Clears, Effect, Fault, FaultKind, Severity
-from bikeped.feedback import SignalLogic
+from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.telemetry import Telemetry, health_line, report_health
 from bikeped.telemetry.builders import encode
@@ -184,10 +184,10 @@ async def test_a_new_fault_needs_a_row_of_the_table_and_a_source(monkeypatch, ef
     row = FaultKind(
         "camera.lens_wet",
         "camera",
+        "There are drops on the lens.",
         effect,
         Severity.WARNING,
         Clears.GOOD_FRAMES,
-        "There are drops on the lens.",
     )
     monkeypatch.setitem(FAULT_KINDS, row.code, row)
     wet = []

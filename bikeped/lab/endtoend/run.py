@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import LoadedConfig
-from bikeped.feedback import SignalLogic
+from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.lab.endtoend.drawn_source import DrawnSource
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
