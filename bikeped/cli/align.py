@@ -130,7 +130,7 @@ def _read_frame(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
 
 def _serve(loaded: LoadedConfig, frame: Frame, picture: Path, port: int, no_browser: bool) -> None:
     from bikeped.web.align import add_align
-    from bikeped.web.serve import serve_pages
+    from bikeped.web.server import serve_pages
 
     def announce(url: str) -> None:
         click.echo(f"{picture.name}: {url}align  (Ctrl-C ends)")
@@ -156,8 +156,7 @@ def _draw(
     import cv2
 
     from bikeped.capture.jpeg import JpegDecoder
-    from bikeped.web.align_draw import draw_grid
-    from bikeped.web.align_grid import ground_grid
+    from bikeped.web.align_grid import draw_grid, ground_grid
 
     camera = ground_camera(loaded)
     if alignment is not None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ from msgspec import Meta
 
 from bikeped.config import CameraConfig, LoadedConfig, framing, ground_camera, load_config
 from bikeped.errors import GeometryError
-from bikeped.geometry.alignment import PARAMETER_NAMES
+from bikeped.geometry.alignment import PARAMETER_NAMES, Alignment
 from bikeped.types import Frame
 from bikeped.web.align_grid import ground_grid
 from bikeped.web.align_points import (
@@ -33,7 +34,6 @@ from bikeped.web.align_points import (
     fit_json,
     fit_points,
     readings,
-    values_of,
     with_values,
 )
 from bikeped.web.align_save import ChangedError, file_hash, lines, save, why_not
@@ -47,11 +47,7 @@ FrameSource = Callable[[], "Frame | bytes | None"]
 _PAGE = Page("/align", "Align", "Align the camera", "align.html", ("align.js",), ("align.css",))
 _QUALITY = 92
 #: A slider's lowest and highest value; those that are missing depend on the radius.
-_SLIDER: dict[str, tuple[float, float]] = {
-    "height_m": (1.0, 10.0),
-    "pitch_deg": (-60.0, 20.0),
-    "heading_deg": (-45.0, 45.0),
-}
+_SLIDER = {"height_m": (1.0, 10.0), "pitch_deg": (-60.0, 20.0), "heading_deg": (-45.0, 45.0)}
 
 
 class GridRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -120,21 +116,13 @@ class AlignHandlers:
             ", ".join(f"camera.{key} {value:g}" for key, value in saved.keys.items()),
             saved.backup.name,
         )
-        return json_answer(
-            {
-                "config": str(saved.config),
-                "backup": str(saved.backup),
-                "keys": saved.keys,
-                "sha256": saved.sha256,
-                "restart": self._live,
-                "promoted": saved.promoted,
-            }
-        )
+        files = {"config": str(saved.config), "backup": str(saved.backup)}
+        return json_answer({**asdict(saved), **files, "restart": self._live})
 
     def _state(self) -> dict[str, Any]:
         in_file = load_config(self._path)
-        running = msgspec.structs.asdict(values_of(self._camera))
-        filed = msgspec.structs.asdict(values_of(ground_camera(in_file)))
+        running = asdict(Alignment.of(self._camera))
+        filed = asdict(Alignment.of(ground_camera(in_file)))
         return {
             "live": self._live,
             "source": str(self._path),

@@ -6,7 +6,7 @@ The page exports the file that `bikeped align FRAME --points` reads.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,14 +36,8 @@ _Name = Annotated[str, Meta(min_length=1, max_length=20)]
 _MAX_BYTES = 1_000_000
 
 #: By how much a parameter is changed to show what that does at 10 m.
-STEPS = {
-    "height_m": 0.1,
-    "pitch_deg": 1.0,
-    "radius_px": 10.0,
-    "cx": 10.0,
-    "cy": 10.0,
-    "heading_deg": 1.0,
-}
+STEPS = {"height_m": 0.1, "pitch_deg": 1.0, "heading_deg": 1.0}
+STEPS |= dict.fromkeys(("radius_px", "cx", "cy"), 10.0)
 
 
 class FrameSize(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -89,13 +83,11 @@ class Points(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frame: FrameSize
     marks: Annotated[list[Point], Meta(max_length=40)]
     between: Annotated[list[Between], Meta(max_length=80)] = []
-    values: Values | None = (
-        None  #: start values, and those that are not fitted; None: as configured
-    )
+    #: Start values, and those that are not fitted; None: as configured.
+    values: Values | None = None
     free: Annotated[tuple[str, ...], Meta(max_length=6)] = ("height_m", "pitch_deg")
-    mark_px: Annotated[float, Meta(ge=0.05, le=100)] = (
-        1.5  #: standard error of a mark, frame pixels
-    )
+    #: Standard errors: of a mark in frame pixels, of a measured distance.
+    mark_px: Annotated[float, Meta(ge=0.05, le=100)] = 1.5
     tape_m: Annotated[float, Meta(ge=0.001, le=10)] = 0.02
 
 
@@ -109,11 +101,6 @@ def load_points(path: Path) -> Points:
         raise BikepedError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BikepedError(f"{path}: {error}; export the marks from the align page anew") from error
-
-
-def values_of(camera: GroundCamera) -> Values:
-    """The values of a camera."""
-    return Values(**asdict(Alignment.of(camera)))
 
 
 def with_values(camera: GroundCamera, values: Values | None) -> GroundCamera:
@@ -134,22 +121,19 @@ def fit_points(
 ) -> tuple[AlignmentFit, Framing]:
     """Fits the points; `framing` is the camera's, whose frames they may be scaled copies of."""
     frame = framing.for_frame(points.frame.width, points.frame.height)
-    names = [point.name for point in points.marks]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise GeometryError(f"marks: {twice[0]} occurs twice; give each mark its own name")
-    marks = []
+    index: dict[str, int] = {}
+    marks: list[Mark] = []
+    spacings = []
     for point in points.marks:
+        if index.setdefault(point.name, len(marks)) < len(marks):
+            raise GeometryError(f"marks: {point.name} occurs twice; give each mark its own name")
         u, v = frame.frame_to_crop((point.u, point.v)).tolist()
         marks.append(Mark(point.name, u, v, point.distance_m, point.forward_m, point.right_m))
     for pair in points.between:
         for name in (pair.first, pair.second):
-            if name not in names:
+            if name not in index:
                 raise GeometryError(f"between: there is no mark {name}; take the distance out")
-    spacings = [
-        Spacing(names.index(pair.first), names.index(pair.second), pair.distance_m)
-        for pair in points.between
-    ]
+        spacings.append(Spacing(index[pair.first], index[pair.second], pair.distance_m))
     accuracy = MeasurementAccuracy(points.tape_m, points.mark_px * frame.scale)
     start = with_values(camera, points.values)
     return fit_alignment(start, marks, spacings, points.free, accuracy), frame
@@ -183,29 +167,20 @@ def readings(camera: GroundCamera, frame: Framing, marks: list[Point]) -> list[d
     """The ground position that the camera reads at each mark, and the frame pixel of the measured
     position. A distance alone is taken along the bearing that the camera reads.
     """
-    if not marks:
-        return []
-    xy, valid = camera.ground(frame.frame_to_crop([(p.u, p.v) for p in marks]))
     answers = []
-    for point, (x, y), there in zip(marks, xy.tolist(), valid, strict=True):
-        if not there:
-            answers.append({"name": point.name, "on_ground": False})
+    for point in marks:
+        xy, valid = camera.ground([frame.frame_to_crop((point.u, point.v))])
+        answer: dict[str, Any] = {"name": point.name, "on_ground": bool(valid[0])}
+        answers.append(answer)
+        if not valid[0]:
             continue
-        at = _measured(point, x, y)
-        place = None
-        if at is not None:
+        x, y = xy[0].tolist()
+        answer |= {"distance_m": math.hypot(x, y), "forward_m": x, "right_m": y}
+        answer["measured_at"] = None
+        if (at := _measured(point, x, y)) is not None:
             uv, seen = camera.project([at])
-            place = frame.crop_to_frame(uv[0]).round(1).tolist() if seen[0] else None
-        answers.append(
-            {
-                "name": point.name,
-                "on_ground": True,
-                "distance_m": math.hypot(x, y),
-                "forward_m": x,
-                "right_m": y,
-                "measured_at": place,
-            }
-        )
+            if seen[0]:
+                answer["measured_at"] = frame.crop_to_frame(uv[0]).round(1).tolist()
     return answers
 
 
@@ -215,15 +190,14 @@ def at_ten_metres(now: GroundCamera, before: GroundCamera, frame: Framing) -> di
     `steps`: change of the reading, metres, when one value grows by its step (`STEPS`).
     """
     pixel = pixel_at_distance(before)
-    here = pixel_at_distance(now)
     if pixel is None:
         return None
-    steps: dict[str, float | None] = {}
-    alignment = asdict(Alignment.of(now))
-    for name in PARAMETER_NAMES:
-        steps[name] = None
-        if here is not None:
-            moved = Alignment(**{**alignment, name: alignment[name] + STEPS[name]})
+    steps: dict[str, float | None] = dict.fromkeys(PARAMETER_NAMES)
+    here = pixel_at_distance(now)
+    if here is not None:
+        alignment = Alignment.of(now)
+        for name, step in STEPS.items():
+            moved = replace(alignment, **{name: getattr(alignment, name) + step})
             reads = ground_distance_m(moved.camera(now), here)
             steps[name] = None if reads is None else reads - 10.0
     return {

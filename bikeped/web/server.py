@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import logging
 import re
+import signal as signals
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ import msgspec
 from aiohttp import hdrs, web
 
 from bikeped import __version__
+from bikeped.config import WebConfig
 from bikeped.errors import BikepedError
+from bikeped.telemetry.http_server import HttpServer
 from bikeped.templates import render
 from bikeped.web.security import (
     COOKIE,
@@ -28,6 +31,7 @@ from bikeped.web.security import (
     Handler,
     check_token,
     guard,
+    load_access_policy,
 )
 
 log = logging.getLogger(__name__)
@@ -36,15 +40,7 @@ T = TypeVar("T")
 
 #: `static/` and `templates/` that all pages share, with those of the live and align pages.
 WEB_FOLDER = Path(__file__).parent
-_TYPES = {
-    ".css": "text/css",
-    ".js": "text/javascript",
-    ".json": "application/json",
-    ".svg": "image/svg+xml",
-    ".png": "image/png",
-    ".webp": "image/webp",
-    ".txt": "text/plain",
-}
+_TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 #: The order of the navigation.
 _ORDER = ("/", "/align", "/testbench")
 _BODY_S = 20.0  #: how long a body may take to arrive
@@ -94,7 +90,7 @@ def make_application(
     app[_POLICY], app[_FAILED_LOGINS] = policy, failures
     app.on_response_prepare.append(_set_security_headers)
     app.router.add_get("/static/{name:.+}", _static)
-    app.router.add_get("/favicon.ico", _favicon)
+    app.router.add_get("/{name:favicon.ico}", _static)
     app.router.add_get("/session", _session)
     app.router.add_get("/login", _login_form)
     app.router.add_post("/login", _log_in)
@@ -120,6 +116,36 @@ def add_page(app: web.Application, page: Page) -> None:
         return _page(request, page)
 
     app.router.add_get(page.path, show)
+
+
+def serve_pages(
+    config: WebConfig,
+    *page_adders: Callable[[web.Application], None],
+    announce: Callable[[str], None],
+    base_dir: Path = Path(),
+    source: str = "web",
+) -> None:
+    """Serves the pages that `page_adders` add until SIGINT or SIGTERM; `announce` gets the address.
+
+    Raises ConfigError when others could reach them without a token, BikepedError when the port
+    cannot be bound.
+    """
+    access = load_access_policy(config, base_dir, source)
+    asyncio.run(_serve(config, make_application(access, *page_adders), announce))
+
+
+async def _serve(config: WebConfig, app: web.Application, announce: Callable[[str], None]) -> None:
+    stop = asyncio.Event()
+    for number in (signals.SIGTERM, signals.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    server = HttpServer(app, config)
+    if not await server.start():
+        raise BikepedError(str(server.error))
+    try:
+        announce(str(server.address))
+        await stop.wait()
+    finally:
+        await server.stop()
 
 
 async def json_body(request: web.Request, kind: type[T]) -> T:
@@ -176,17 +202,10 @@ def _load_static(folder: Path) -> dict[str, _File]:
 
 
 async def _static(request: web.Request) -> web.StreamResponse:
-    file = request.app[_FILES].get(request.match_info["name"])
+    name = request.match_info["name"]
+    file = request.app[_FILES].get("icon.svg" if name == "favicon.ico" else name)
     if file is None:
         raise web.HTTPNotFound(text="There is no such file.")
-    return _answer_file(request, file)
-
-
-async def _favicon(request: web.Request) -> web.StreamResponse:
-    return _answer_file(request, request.app[_FILES]["icon.svg"])
-
-
-def _answer_file(request: web.Request, file: _File) -> web.StreamResponse:
     # Browsers revalidate each time: after an update a page must not run on the old scripts.
     headers = {hdrs.ETAG: f'"{file.etag}"', hdrs.CACHE_CONTROL: "no-cache"}
     if any(tag.value == file.etag for tag in request.if_none_match or ()):

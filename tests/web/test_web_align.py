@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import AsyncIterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from aiohttp.test_utils import TestClient, TestServer
 from web_fakes import LOCKED, OPEN, Scene, web_context
 
 from bikeped.config import framing, ground_camera, load_config
+from bikeped.geometry.alignment import Alignment
 from bikeped.types import Frame
 from bikeped.web.align import add_align
 from bikeped.web.align_grid import ground_grid
-from bikeped.web.align_points import values_of
 from bikeped.web.server import make_application
 from bikeped.web.service_pages import ServicePages
 
@@ -83,7 +84,7 @@ async def start() -> AsyncIterator[Any]:
 
 
 def values(site: Site, **changes: float) -> dict[str, float]:
-    return {**msgspec.structs.asdict(values_of(ground_camera(site.loaded))), **changes}
+    return {**asdict(Alignment.of(ground_camera(site.loaded))), **changes}
 
 
 async def test_the_grid_is_the_deployed_geometry_s(place: Path, start) -> None:

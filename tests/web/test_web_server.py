@@ -22,8 +22,7 @@ from web_fakes import OPEN
 from bikeped.config import WebConfig
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.telemetry.http_server import HttpServer
-from bikeped.web.serve import serve_pages
-from bikeped.web.server import Page, add_page, json_answer, json_body, make_application
+from bikeped.web.server import Page, add_page, json_answer, json_body, make_application, serve_pages
 
 WEB = Path(__file__).parents[2] / "bikeped" / "web"
 STATIC, TEMPLATES = WEB / "static", WEB / "templates"

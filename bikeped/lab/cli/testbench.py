@@ -51,7 +51,7 @@ def command(
     import msgspec
 
     from bikeped.lab.testbench.pages import add_testbench
-    from bikeped.web.serve import serve_pages
+    from bikeped.web.server import serve_pages
 
     loaded, scenarios, origin = _load(config_path, overrides, scenarios_dir)
     given = {"port": port, "host": host}
