@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,16 +58,12 @@ def command(
     web = msgspec.structs.replace(
         loaded.config.web, **{key: value for key, value in given.items() if value is not None}
     )
-    screen = console()
-    serve_pages(
-        web,
-        lambda app: add_testbench(app, loaded, scenarios, origin),
-        announce=lambda url: screen.print(
-            f"Test bench: {escape(url)}testbench (Ctrl-C ends it)", soft_wrap=True
-        ),
-        base_dir=loaded.base_dir,
-        source=loaded.source,
-    )
+
+    def announce(url: str) -> None:
+        console().print(f"Test bench: {escape(url)}testbench (Ctrl-C ends it)", soft_wrap=True)
+
+    add = partial(add_testbench, loaded=loaded, scenarios=scenarios, origin=origin)
+    serve_pages(web, add, announce=announce, base_dir=loaded.base_dir, source=loaded.source)
 
 
 @command.command("contest")
@@ -89,14 +85,9 @@ def contest(
     """
     from bikeped.lab.testbench.comparison import compare_settings
     from bikeped.lab.testbench.runner import BenchRunner, trial_summaries
-    from bikeped.lab.testbench.settings import settings_from_link, settings_in_force
 
-    file = _as_file(challenge)
     loaded, scenarios, origin = _load(config_path, overrides, scenarios_dir)
-    if file is None:
-        bench = settings_from_link(challenge, settings_in_force(loaded))
-    else:
-        bench = _read(file)
+    bench = _read_challenge(challenge, loaded)
     work = BenchRunner(loaded, scenarios)
     comparison = compare_settings(work, bench).as_dict()
     trials = trial_summaries(work.full_suite(bench), bench)
@@ -104,12 +95,10 @@ def contest(
     if json_path is not None:
         write_json({"command": words, **comparison, "trials": trials}, json_path)
     print_comparison(comparison, words, console(json_path))
-    if trials is not None:
-        mean = trials["sensitivity"]
-        if mean["mean"] is not None:
-            console(json_path).print(
-                f"Over {trials['trials']} trials of misses: sensitivity {100 * mean['mean']:.1f} %."
-            )
+    if trials is not None and (mean := trials["sensitivity"]["mean"]) is not None:
+        console(json_path).print(
+            f"Over {trials['trials']} trials of misses: sensitivity {100 * mean:.1f} %."
+        )
 
 
 @command.command("export")
@@ -152,22 +141,24 @@ def _load(
     return loaded, scenarios, InvocationOptions(config_path, scenarios_dir, overrides)
 
 
-def _as_file(challenge: str) -> Path | None:
-    """`challenge` as a path; None when it is a link."""
-    if "=" not in challenge and "#" not in challenge:
-        return Path(challenge)
-    with contextlib.suppress(OSError, ValueError):  # a link can be longer than any name
-        if Path(challenge).is_file():
-            return Path(challenge)
-    return None
+def _read_challenge(challenge: str, loaded: LoadedConfig) -> BenchSettings:
+    """The settings of a saved file, or of a link."""
+    from bikeped.lab.testbench.settings import (
+        settings_from_file,
+        settings_from_link,
+        settings_in_force,
+    )
 
-
-def _read(path: Path) -> BenchSettings:
-    from bikeped.lab.testbench.settings import settings_from_file
-
+    path = Path(challenge)
+    try:
+        is_file = not ("=" in challenge or "#" in challenge) or path.is_file()
+    except (OSError, ValueError):  # longer than any file's name
+        is_file = False
+    if not is_file:
+        return settings_from_link(challenge, settings_in_force(loaded))
     try:
         if path.stat().st_size > 1_000_000:
             raise BikepedError(f"{path}: larger than 1 MB; a challenge is a short text")
-        return settings_from_file(path.read_bytes(), str(path))
+        return settings_from_file(path.read_bytes(), challenge)
     except OSError as error:
         raise BikepedError(f"{path}: cannot be read ({error.strerror}); check the path") from error

@@ -20,6 +20,7 @@ from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.decision.episodes import runs
 from bikeped.lab.governance.gates import check_gates
 from bikeped.lab.governance.what_if import Comparison, Variant, compare_variants
+from bikeped.lab.testbench.playback import danger_tier
 from bikeped.lab.testbench.runner import BenchRunner
 from bikeped.lab.testbench.settings import (
     VIEW_KEYS,
@@ -28,6 +29,7 @@ from bikeped.lab.testbench.settings import (
     settings_in_force,
     settings_to_file,
     settings_to_link,
+    value_text,
 )
 
 
@@ -122,14 +124,8 @@ def contest_command(
         section, _, name = change["key"].partition(".")
         truth = section == "danger"
         words += ["--truth", f"{name}="] if truth else ["--set", f"{change['key']}="]
-        words[-1] += _option_value(change["after"])
+        words[-1] += value_text(change["after"])
     return f"{origin.command_line('conformance', 'contest')} {shlex.join(words)}"
-
-
-def _option_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return repr(value) if isinstance(value, float) else str(value)
 
 
 def _strip(comparison: Comparison, name: str) -> dict[str, Any]:
@@ -141,7 +137,7 @@ def _strip(comparison: Comparison, name: str) -> dict[str, Any]:
         "name": name,
         "hazard": suite.scenarios[index].hazard,
         "frames": len(truth.time_s),
-        "truth": encode_runs(truth.danger.astype(int) + truth.imminent),
+        "truth": encode_runs(danger_tier(truth)),
         "before": _states(comparison.before, name),
         "after": _states(comparison.after, name),
     }

@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -27,7 +26,7 @@ from bikeped.config.provenance import DECIDING_CODE, code_hash
 from bikeped.config.schema.base import Section
 from bikeped.lab.experiments.optimizer import BOUNDS
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
-from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
+from bikeped.lab.simulation.suite import CONFIGURATIONS
 from bikeped.lab.testbench.comparison import InvocationOptions, comparison_json
 from bikeped.lab.testbench.playback import TESTS, TIERS, coverage, playback
 from bikeped.lab.testbench.runner import BenchRunner, trial_summaries
@@ -46,15 +45,8 @@ from bikeped.web.server import Page, add_page, json_answer, json_body
 T = TypeVar("T")
 
 _MOST_WAITING = 16
-PAGE = Page(
-    "/testbench",
-    "Test bench",
-    "Test bench",
-    "testbench.html",
-    scripts=("testbench.js",),
-    styles=("testbench.css",),
-    folder=Path(__file__).parent,
-)
+_FILES = ("testbench.html", ("testbench.js",), ("testbench.css",), Path(__file__).parent)
+PAGE = Page("/testbench", "Test bench", "Test bench", *_FILES)
 
 
 class BenchRequest(Section, frozen=True):
@@ -91,10 +83,8 @@ def add_testbench(
         async def run(request: web.Request) -> web.Response:
             body = await json_body(request, BenchRequest)
             check_settings(body.bench)
-            job = partial(_encoded, compute, body.bench)
-            return web.Response(
-                body=await queue.run(body.client, job), content_type="application/json"
-            )
+            answer = await queue.run(body.client, lambda: msgspec.json.encode(compute(body.bench)))
+            return web.Response(body=answer, content_type="application/json")
 
         app.router.add_post(path, run)
 
@@ -125,10 +115,6 @@ def add_testbench(
     app.router.add_post("/testbench/read-challenge", read_challenge)
 
 
-def _encoded(compute: Callable[[BenchSettings], Any], bench: BenchSettings) -> bytes:
-    return msgspec.json.encode(compute(bench))
-
-
 def configurations(loaded: LoadedConfig) -> dict[str, DecisionConfig]:
     """The named configurations, and the one in force where it is none of them."""
     if loaded.config.decision in CONFIGURATIONS.values():
@@ -142,14 +128,10 @@ def scenario_json(
     """The playback of the scenario shown, under the bench's decision and those beside it."""
     suite = work.shown_suite(bench)
     name = next((n for n, d in named.items() if d == bench.decision), "bench")
-    sides = {name: bench.decision}
-    for name in bench.beside:
-        if name in named:
-            sides[name] = named[name]
-    views = [coverage(suite.camera, pose) for pose in suite.poses]
+    sides = {name: bench.decision, **{n: named[n] for n in bench.beside if n in named}}
     return {
         **playback(suite, 0, sides),
-        "cameras": views,
+        "cameras": [coverage(suite.camera, pose) for pose in suite.poses],
         "link": settings_to_link(bench, settings_in_force(work.loaded)),
         "script": script(suite.scenarios[0]),
     }
@@ -162,36 +144,23 @@ def trials_json(work: BenchRunner, bench: BenchSettings) -> dict[str, Any]:
 
 def script(scenario: Scenario) -> dict[str, Any]:
     """A scenario as the editor holds it."""
-    return {
-        "name": scenario.name,
-        "hazard": scenario.hazard,
-        "expected": scenario.expected,
-        "vehicle": scenario.vehicle,
-        "story": scenario.story,
-        "agents": [
-            {
-                "id": a.id,
-                "kind": a.kind,
-                "path": a.path.tolist(),
-                **({} if a.size_m == SIZES_M[a.kind] else {"size": _size(a.size_m)}),
-            }
-            for a in scenario.agents
-        ],
-    }
-
-
-def _size(size_m: tuple[float, float, float]) -> dict[str, float]:
-    return dict(zip(("length", "width", "height"), size_m, strict=True))
+    agents: list[dict[str, Any]] = []
+    for agent in scenario.agents:
+        agents.append({"id": agent.id, "kind": agent.kind, "path": agent.path.tolist()})
+        if agent.size_m != SIZES_M[agent.kind]:
+            size = zip(("length", "width", "height"), agent.size_m, strict=True)
+            agents[-1]["size"] = dict(size)
+    keys = ("name", "hazard", "expected", "vehicle", "story")
+    return {**{key: getattr(scenario, key) for key in keys}, "agents": agents}
 
 
 def page_description(work: BenchRunner, named: dict[str, DecisionConfig]) -> dict[str, Any]:
     """What the page loads once: scenarios, configurations, ranges and code hashes."""
     base = settings_in_force(work.loaded)
-    suite: Suite = work.full_suite(base)
     return {
         "version": __version__,
         "rule_hash": code_hash(DECIDING_CODE),
-        "suite_hash": suite.hash,
+        "suite_hash": work.full_suite(base).hash,
         "config_hash": work.loaded.hash,
         "base": base,
         "link": settings_to_link(base, base),
@@ -205,10 +174,7 @@ def page_description(work: BenchRunner, named: dict[str, DecisionConfig]) -> dic
         "ranges": ranges(),
         "scenarios": [
             {
-                "name": s.name,
-                "hazard": s.hazard,
-                "story": s.story,
-                "duration_s": s.duration_s,
+                **{key: getattr(s, key) for key in ("name", "hazard", "story", "duration_s")},
                 "agents": len(s.agents),
             }
             for s in work.scenarios
@@ -223,9 +189,8 @@ def ranges() -> dict[str, Any]:
         if not (isinstance(section.type, type) and issubclass(section.type, Section)):
             continue
         schema = msgspec.json.schema(section.type)["$defs"][section.type.__name__]
-        meanings: dict[str, str] = {}
-        for kind in section.type.__mro__[: section.type.__mro__.index(Section)]:
-            meanings |= key_descriptions(kind)
+        kinds = section.type.__mro__[: section.type.__mro__.index(Section)]
+        meanings = {key: text for kind in kinds for key, text in key_descriptions(kind).items()}
         for key, value in schema["properties"].items():
             found[f"{section.name}.{key}"] = {
                 "low": value.get("minimum", value.get("exclusiveMinimum")),

@@ -20,7 +20,7 @@ from bikeped.lab.simulation.metrics import finite_or_none, measure
 from bikeped.lab.simulation.simulate import FPS, verdicts
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.lab.testbench.runner import BenchSuite
-from bikeped.types import BoolArray, FloatArray, Kind, State
+from bikeped.types import BoolArray, FloatArray, IntArray, Kind, State
 
 #: Codes of the truth's tiers in `truth.tier`.
 TIERS = ("none", "actionable", "imminent")
@@ -34,7 +34,10 @@ def playback(
     """Scenario `index` as JSON data: road users, tracks, ground truth, and each decision."""
     scenario, truth = suite.scenarios[index], suite.truths[index]
     return {
-        "scenario": scenario_facts(suite, index),
+        "scenario": {
+            key: getattr(scenario, key)
+            for key in ("name", "hazard", "vehicle", "story", "duration_s")
+        },
         "frames": len(truth.time_s),
         "fps": FPS,
         "agents": _agents(suite, index),
@@ -47,18 +50,6 @@ def playback(
         "sides": [_side(suite, index, name, d) for name, d in decisions.items()],
         "expected": scenario.expected,
         "tests": list(TESTS),
-    }
-
-
-def scenario_facts(suite: BenchSuite, index: int) -> dict[str, Any]:
-    """Name, hazard, vehicle, story and duration of a scenario."""
-    scenario = suite.scenarios[index]
-    return {
-        "name": scenario.name,
-        "hazard": scenario.hazard,
-        "vehicle": scenario.vehicle,
-        "story": scenario.story,
-        "duration_s": scenario.duration_s,
     }
 
 
@@ -90,21 +81,14 @@ def coverage(camera: GroundCamera, pose: CameraPose) -> dict[str, Any]:
 
 def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
     """Each agent's true path, and its detections in the frames that the tracker gets."""
-    scenario, scene, seen = (
-        suite.scenarios[index],
-        suite.shown_detections[index],
-        suite.perception_results[index],
-    )
-    time_s = suite.truths[index].time_s
+    scene, seen = suite.shown_detections[index], suite.perception_results[index]
     late = suite.delay.frames
     found = []
-    for a, agent in enumerate(scenario.agents):
-        xy, heading, _ = agent.sample(time_s)
+    for a, agent in enumerate(suite.scenarios[index].agents):
+        xy, heading, _ = agent.sample(suite.truths[index].time_s)
         put = np.where(scene.detected[:, a, None], scene.xy_m[:, a], np.nan)
-        detected = np.full_like(put, np.nan)
-        if late < len(put):
-            detected[late:] = suite.pose.ground_to_world(put[: len(put) - late])
-        error = np.hypot(*(put - seen.true_m[:, a]).T)
+        # 1 in frames in which the agent is in view and the detector missed it
+        missed = (seen.present[:, a] & ~scene.detected[:, a]).astype(float)
         found.append(
             {
                 "id": agent.id,
@@ -113,20 +97,13 @@ def _agents(suite: BenchSuite, index: int) -> list[dict[str, Any]]:
                 "size_m": list(agent.size_m),
                 "true": _flat(xy),
                 "heading": _rounded(heading),
-                "detected": _flat(detected),
-                "missed": _missed(suite, index, a),
-                "error_m": _rounded(_delayed(error, late)),
+                "detected": _flat(_delayed(suite.pose.ground_to_world(put), late)),
+                "missed": np.nan_to_num(_delayed(missed, late)).astype(int).tolist(),
+                "error_m": _rounded(_delayed(np.hypot(*(put - seen.true_m[:, a]).T), late)),
                 "path": agent.path.tolist(),
             }
         )
     return found
-
-
-def _missed(suite: BenchSuite, index: int, agent: int) -> list[int]:
-    """1 in frames in which the agent is in view and the detector missed it."""
-    scene, there = suite.shown_detections[index], suite.perception_results[index].present[:, agent]
-    missed = (there & ~scene.detected[:, agent]).astype(float)
-    return [int(v) for v in np.nan_to_num(_delayed(missed, suite.delay.frames))]
 
 
 def _delayed(values: FloatArray, frames: int) -> FloatArray:
@@ -152,17 +129,18 @@ def _tracks(suite: BenchSuite, index: int) -> dict[str, Any]:
 
 
 def _truth(truth: GroundTruth) -> dict[str, Any]:
+    numbers = ("distance_m", "nearest_m", "d_min_m", "ttc_s", "budget_s", "severity")
     return {
-        "tier": (truth.danger.astype(int) + truth.imminent).tolist(),
-        "distance_m": _rounded(truth.distance_m),
-        "nearest_m": _rounded(truth.nearest_m),
-        "d_min_m": _rounded(truth.d_min_m),
-        "ttc_s": _rounded(truth.ttc_s),
-        "budget_s": _rounded(truth.budget_s),
-        "severity": _rounded(truth.severity),
+        "tier": danger_tier(truth).tolist(),
+        **{key: _rounded(getattr(truth, key)) for key in numbers},
         "cyclist": truth.cyclist.tolist(),
         "pedestrian": truth.pedestrian.tolist(),
     }
+
+
+def danger_tier(truth: GroundTruth) -> IntArray:
+    """The tier [f] of every frame, as an index of `TIERS`."""
+    return np.asarray(truth.danger.astype(int) + truth.imminent)
 
 
 def _closest(truth: GroundTruth) -> float:
@@ -177,32 +155,24 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
     frames = run.frame_slice(index)
     codes = suite.states(decision)
     found = verdicts(run, settings)
-    metrics = measure(suite.truth_frames, codes)
     own = codes[frames]
     truth = suite.truths[index]
     pair_frame = run.rows.frame[run.pairs.pedestrian_row]
     start = np.searchsorted(pair_frame, np.arange(frames.start, frames.stop + 1))
-    kind = run.rows.kind
-    row_start = np.searchsorted(run.rows.frame, np.arange(frames.start, frames.stop + 1))
-    pedestrians = np.add.reduceat(
-        np.append(kind == int(Kind.PEDESTRIAN), False), np.minimum(row_start[:-1], len(kind))
-    )
-    pedestrians = np.where(row_start[1:] > row_start[:-1], pedestrians, 0)
+    walking = run.rows.frame[run.rows.kind == int(Kind.PEDESTRIAN)]
+    pedestrians = np.bincount(walking, minlength=frames.stop)[frames]
     since = run.time_s[frames] - run.cyclist_last_s[frames]
     sentences, chosen = [], []
     for i in range(len(own)):
         part = slice(int(start[i]), int(start[i + 1]))
         state = State(int(own[i]))
         at = select_pair(state, found.fires[part], found.distance_m[part])
-        pair = (
-            None
-            if at is None
-            else pair_metrics(part.start + at, run.rows, run.pairs, found, settings)
-        )
+        pair = None
+        if at is not None:
+            pair = pair_metrics(part.start + at, run.rows, run.pairs, found, settings)
         sentences.append(explain(state, pair, int(pedestrians[i]), float(since[i]), settings))
         chosen.append(-1 if at is None else part.start + at - int(start[0]))
     alert = own == int(State.ALERT)
-    begins = np.nonzero(onsets(alert))[0]
     return {
         "name": name,
         "decision": msgspec.to_builtins(decision),
@@ -224,23 +194,23 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
                 "budget_s": finite_or_none(float(truth.budget_s[i])),
                 "danger": bool(truth.danger[i]),
             }
-            for i in begins
+            for i in np.flatnonzero(onsets(alert))
         ],
-        "metrics": metrics.scenario_dict(index),
+        "metrics": measure(suite.truth_frames, codes).scenario_dict(index),
         "counts": _counts(truth, alert),
     }
 
 
 def _counts(truth: GroundTruth, alert: BoolArray) -> dict[str, int]:
     """Frames by truth and alert, of this scenario."""
-    return {
-        "frames": len(alert),
-        "danger": int(truth.danger.sum()),
-        "actionable": int(truth.actionable.sum()),
-        "actionable_alert": int((truth.actionable & alert).sum()),
-        "calm": int((~truth.danger).sum()),
-        "calm_alert": int((~truth.danger & alert).sum()),
+    masks = {
+        "danger": truth.danger,
+        "actionable": truth.actionable,
+        "actionable_alert": truth.actionable & alert,
+        "calm": ~truth.danger,
+        "calm_alert": ~truth.danger & alert,
     }
+    return {"frames": len(alert), **{key: int(mask.sum()) for key, mask in masks.items()}}
 
 
 def _pairs(suite: BenchSuite, found: PairChecks, part: slice, start: Any) -> dict[str, Any]:
@@ -252,17 +222,14 @@ def _pairs(suite: BenchSuite, found: PairChecks, part: slice, start: Any) -> dic
     for bit, field in enumerate(TESTS.values()):
         bits |= getattr(found, field)[part].astype(np.int64) << bit
     reach = np.maximum(np.hypot(*run.rows.xy_m[cyclist].T), np.hypot(*run.rows.xy_m[pedestrian].T))
+    numbers = ("distance_m", "lookback_s", "displacement_m", "speed_mps", "d_max_m")
     return {
         "start": (start - start[0]).tolist(),
         "cyclist": run.rows.id[cyclist].tolist(),
         "pedestrian": run.rows.id[pedestrian].tolist(),
         "passes": bits.tolist(),
-        "distance_m": _rounded(found.distance_m[part]),
+        **{key: _rounded(getattr(found, key)[part]) for key in numbers},
         "then_m": _rounded(found.distance_then_m[part]),
-        "lookback_s": _rounded(found.lookback_s[part]),
-        "displacement_m": _rounded(found.displacement_m[part]),
-        "speed_mps": _rounded(found.speed_mps[part]),
-        "d_max_m": _rounded(found.d_max_m[part]),
         "reach_m": _rounded(reach),
     }
 

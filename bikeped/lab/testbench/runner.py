@@ -109,22 +109,13 @@ class BenchSuite(Suite):
     def with_truth(self, settings: GroundTruthSettings) -> BenchSuite:
         """The same suite under other thresholds; perception is not computed again."""
         other = replace(self, truth_settings=settings)
-        for name in _KEPT:
-            if name in self.__dict__:
-                other.__dict__[name] = self.__dict__[name]
+        other.__dict__.update({key: self.__dict__[key] for key in _KEPT & self.__dict__.keys()})
         return other
 
 
-_KEPT = (
-    "names",
-    "perception_results",
-    "second_perception_results",
-    "observed",
-    "shown_detections",
-    "track_history",
-    "rule_input",
-    "hash",
-)
+#: Cached properties that do not depend on the ground truth's thresholds.
+_KEPT = {"names", "hash", "perception_results", "second_perception_results", "observed"}
+_KEPT |= {"shown_detections", "track_history", "rule_input"}
 
 
 def trial_summaries(suite: BenchSuite, bench: BenchSettings) -> dict[str, Any] | None:
@@ -184,13 +175,10 @@ class BenchRunner:
 
     def shown_suite(self, bench: BenchSettings) -> BenchSuite:
         """A suite of the scenario shown only."""
-        scenarios = self.suite_scenarios(bench)
-        if not bench.scenario:
-            return self._suite(bench, scenarios[:1])
-        found = tuple(s for s in scenarios if s.name == bench.scenario)
-        if not found:
-            raise BikepedError(f"scenario {bench.scenario!r}: does not exist; choose another")
-        return self._suite(bench, found)
+        for scenario in self.suite_scenarios(bench):
+            if bench.scenario in ("", scenario.name):
+                return self._suite(bench, (scenario,))
+        raise BikepedError(f"scenario {bench.scenario!r}: does not exist; choose another")
 
     def _suite(self, bench: BenchSettings, scenarios: tuple[Scenario, ...]) -> BenchSuite:
         check_work(scenarios)
@@ -198,7 +186,8 @@ class BenchRunner:
             camera = camera_with_mount(self.loaded, bench.camera)
             pose = bench.camera.pose()
             second = None if bench.second_camera is None else bench.second_camera.pose()
-            texts = [self._text(s) for s in scenarios]
+            # A scenario's key is its text; ids of bundled ones stay taken.
+            texts = [self._texts.get(id(s)) or dump_scenario(s) for s in scenarios]
             where = msgspec.json.encode(bench.camera)
             # The number of trials that are averaged does not change the one that is shown.
             perception = msgspec.structs.replace(bench.perception, trials=1)
@@ -227,11 +216,6 @@ class BenchRunner:
                 for text, scenario in zip(texts, scenarios, strict=True)
             )
             return with_truth
-
-    def _text(self, scenario: Scenario) -> str:
-        """The scenario as YAML: its cache key."""
-        known = self._texts.get(id(scenario))  # bundled ones, whose ids stay taken
-        return dump_scenario(scenario) if known is None else known
 
 
 class _LruCache(Generic[T]):

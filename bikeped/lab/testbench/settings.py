@@ -170,11 +170,10 @@ def camera_with_mount(loaded: LoadedConfig, mount: Mount) -> GroundCamera:
 
 def check_settings(bench: BenchSettings) -> BenchSettings:
     """Checks keys against one another; BikepedError names key and remedy."""
-    decision = bench.decision
-    if decision.d_min_m > decision.d_max_m:
+    low_m, high_m = bench.decision.d_min_m, bench.decision.d_max_m
+    if low_m > high_m:
         raise BikepedError(
-            f"decision.d_min_m: {decision.d_min_m:g} is above decision.d_max_m "
-            f"{decision.d_max_m:g}; exchange them"
+            f"decision.d_min_m: {low_m:g} is above decision.d_max_m {high_m:g}; exchange them"
         )
     return bench
 
@@ -217,11 +216,13 @@ def parse_custom_scenario(text: str, source: str) -> Scenario:
 def settings_to_link(bench: BenchSettings, base: BenchSettings) -> str:
     """The keys that differ from `base` as `key=value&...`, e.g. `decision.d_max_m=15`."""
     return "&".join(
-        f"{key}={quote(_text(value), safe='')}" for key, _, value in differing_keys(bench, base)
+        f"{key}={quote(value_text(value), safe='')}"
+        for key, _, value in differing_keys(bench, base)
     )
 
 
-def _text(value: Any) -> str:
+def value_text(value: Any) -> str:
+    """A value of a setting as in links and in `--set key=value`."""
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 
@@ -268,13 +269,9 @@ def _value(text: str, key: str) -> Any:
     if key == "scenario":
         return text
     try:
-        return json.loads(text, parse_constant=_no_number)
-    except (ValueError, RecursionError):
+        return msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeError, RecursionError):
         return text  # a word: decision.rule=ttc
-
-
-def _no_number(name: str) -> Any:
-    raise ValueError(f"{name} is not a number")
 
 
 # --- as a file
@@ -282,20 +279,15 @@ def _no_number(name: str) -> Any:
 
 def settings_to_file(bench: BenchSettings, base: BenchSettings, facts: dict[str, Any]) -> str:
     """A file of all settings, with the hashes that they were measured with."""
-    data = {
-        "format": 1,
-        **facts,
-        "link": settings_to_link(bench, base),
-        "bench": msgspec.to_builtins(bench),
-    }
-    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+    settings = {"link": settings_to_link(bench, base), "bench": msgspec.to_builtins(bench)}
+    return json.dumps({"format": 1, **facts, **settings}, indent=2, allow_nan=False) + "\n"
 
 
 def settings_from_file(text: str | bytes, source: str) -> BenchSettings:
     """The settings of a saved file; BikepedError names file, key and remedy."""
     try:
-        data = json.loads(text, parse_constant=_no_number)
-    except (ValueError, RecursionError) as error:
+        data = msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
         raise BikepedError(
             f"{source}: is not JSON ({error}); save the file again in the test bench"
         ) from error
