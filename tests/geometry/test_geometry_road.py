@@ -86,5 +86,5 @@ def test_parts_of_copies():
         (0.5, 0, 0.4, 1, 1),
         (0, 0, 1, 1, 0),
     ):
-        with pytest.raises(ValueError, match="no part"):
+        with pytest.raises(ValueError, match="not a part"):
             Region(*bad)
