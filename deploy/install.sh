@@ -213,10 +213,10 @@ run_doctor() {
   # The service holds camera and lamps, so what it has already taken shows as busy: not a failure.
   if [[ "$system" == yes ]]; then
     run runuser -u "$SERVICE" -- "$current/bin/bikeped" doctor -c "$config" ||
-      say "doctor found something to mend: see above"
+      say "doctor found a problem: see above"
   else
     run "$current/bin/bikeped" doctor -c "$config" ||
-      say "doctor found something to mend: see above"
+      say "doctor found a problem: see above"
   fi
 }
 
@@ -239,7 +239,7 @@ if [[ "$rollback" == yes ]]; then
   back="$(readlink "$previous")"
   [[ -d "$back" ]] || fail "$previous: points to $back, which is gone"
   run "$back/bin/bikeped" config check -c "$config" ||
-    fail "the release before refuses $config (see above); mend it first"
+    fail "the release before refuses $config (see above); correct it first"
   was="$(readlink "$current")"
   point "$current" "$back"
   point "$previous" "$was"

@@ -1,7 +1,8 @@
 """Trains the bundled small detector: draws streets, trains, tests, writes the card.
 
     scripts/train-detector --out DIR              all steps, an hour and a quarter on two cores
-    scripts/train-detector --out DIR --ship       and copies model and card into the package
+    scripts/train-detector --out DIR --ship       and copies the model into the package, its
+                                                  card into docs/
     scripts/train-detector --out DIR --experiment rectilinear against fisheye-augmented training
     scripts/train-detector --measure              tests the package's model again, on pictures as
                                                   they are drawn now, and writes its card
@@ -60,6 +61,8 @@ from bikeped.lab.training.weights import SmallDetector, load_weights
 from bikeped.models import BUNDLED_FILE
 from bikeped.types import Kind
 
+#: The model card, which `--ship`, `--measure` and `--card` write.
+CARD = Path(__file__).parents[1] / "docs" / "bundled-detector.md"
 #: The steps take less than an hour on two cores that multiply bfloat16 themselves.
 PICTURES, STEPS = 5000, 11200
 #: Width and height of the shipped network's input for a whole frame: 30 frames a second on two
@@ -91,7 +94,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="folder for everything")
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--pictures", type=int, default=PICTURES)
-    parser.add_argument("--ship", action="store_true", help="copy model and card into the package")
+    parser.add_argument("--ship", action="store_true", help="copy the model into the package, its card into docs/")
     parser.add_argument("--experiment", action="store_true")
     parser.add_argument("--measure", action="store_true", help="measure the package's model again")
     parser.add_argument("--card", action="store_true", help="write the card from its figures")
@@ -108,9 +111,10 @@ def main() -> int:
         return 0
     build(out, options.pictures, options.steps)
     if options.ship:
-        for name in ("small.onnx", "small-int8.onnx", "small.json", "small.md"):
-            shutil.copyfile(out / name, BUNDLED_FILE.with_name(name))
-            say(f"wrote {BUNDLED_FILE.with_name(name)}")
+        names = ("small.onnx", "small-int8.onnx", "small.json")
+        for target in (*map(BUNDLED_FILE.with_name, names), CARD):
+            shutil.copyfile(out / target.name, target)
+            say(f"wrote {target}")
     return 0
 
 
@@ -187,8 +191,8 @@ def build(out: Path, pictures: int, steps: int) -> None:
     if (out / "experiment.json").is_file():
         card["experiment"] = read(out / "experiment.json")
     write_json(out / "small.json", card)
-    write_whole(out / "small.md", render_card(card))
-    say(f"wrote {out / 'small.onnx'}, small-int8.onnx, small.json, small.md")
+    write_whole(out / CARD.name, render_card(card))
+    say(f"wrote {out / 'small.onnx'}, small-int8.onnx, small.json, {CARD.name}")
 
 
 def measured(folder: Path, loaded: LoadedConfig) -> dict[str, Any]:
@@ -221,8 +225,8 @@ def write_card(measure: bool) -> None:
         card |= measured(folder, load_config(None))
         card["made"]["measured"] = commit()
         write_json(folder / "small.json", card)
-    write_whole(folder / "small.md", render_card(card))
-    say(f"wrote {folder / 'small.json'}, small.md")
+    write_whole(CARD, render_card(card))
+    say(f"wrote {folder / 'small.json'}, {CARD}")
 
 
 def shipped_as(loaded: LoadedConfig, model: Path) -> DetectionConfig:

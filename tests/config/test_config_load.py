@@ -1,4 +1,4 @@
-"""Reading a configuration: any text ends in a configuration or in one line that says the mend."""
+"""Reading a configuration: any text ends in a configuration or in one line that says the remedy."""
 
 import json
 import math

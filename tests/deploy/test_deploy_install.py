@@ -170,7 +170,7 @@ def test_a_release_that_refuses_the_configuration_never_becomes_current(bench: B
 
 def test_a_doctors_finding_is_told_and_does_not_stop(bench: Bench) -> None:
     bench.answer("doctor", 1)
-    assert "something to mend" in bench.run().stdout
+    assert "doctor found a problem" in bench.run().stdout
 
 
 def test_rollback_goes_back_and_forth(bench: Bench) -> None:

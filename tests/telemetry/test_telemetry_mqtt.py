@@ -351,7 +351,7 @@ async def test_a_broker_that_wants_a_password(make_broker, listen, tmp_path):
     await until(lambda: mqtt.status.error is not None)
     assert "mqtt.password_file" in (mqtt.status.error or "")
     assert mqtt.status.connects == 0
-    secret.write_text("right\n")  # mended while running: taken up by the next attempt
+    secret.write_text("right\n")  # corrected while running: taken up by the next attempt
     await connected(mqtt)
     async with listen(
         broker.port, "bikeped/secret/availability", username="pole", password="right"

@@ -1,4 +1,4 @@
-"""Credentials: every unusable file or contradiction is one line with file, key and mend."""
+"""Credentials: every unusable file or contradiction is one line with file, key and remedy."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ _UNTRAINED_AP = 0.2  #: a lower average precision of all road users says little
 
 
 def render_card(card: Mapping[str, Any]) -> str:
-    """Markdown; `card` is what `scripts/train-detector` writes as JSON beside it."""
+    """Markdown; `card` is what `scripts/train-detector` writes into small.json."""
     values: dict[str, Any] = {"reached": meets_target(card["configured_camera"])}
     if "experiment" in card:
         runs = [card["experiment"][name]["road_users"] for name in ("ordinary", "augmented")]
