@@ -94,7 +94,9 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="folder for everything")
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--pictures", type=int, default=PICTURES)
-    parser.add_argument("--ship", action="store_true", help="copy the model into the package, its card into docs/")
+    parser.add_argument(
+        "--ship", action="store_true", help="copy the model into the package, its card into docs/"
+    )
     parser.add_argument("--experiment", action="store_true")
     parser.add_argument("--measure", action="store_true", help="measure the package's model again")
     parser.add_argument("--card", action="store_true", help="write the card from its figures")

@@ -111,20 +111,10 @@ def _read_frame(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
 
     if not picture.exists():
         raise CaptureError(f"{picture}: no such file; give a picture or a video of the camera")
-    camera = loaded.config.camera
-    source = open_source(
-        str(picture.absolute()),
-        width=camera.width,
-        height=camera.height,
-        fps=camera.fps,
-        fourcc=camera.fourcc,
-    )
-    try:
+    with open_source(loaded.config.camera, str(picture.absolute())) as source:
         for frame in iter(source.read, None):
             if frame.captured_s >= at_s - 1e-6:
                 return frame
-    finally:
-        source.close()
     raise CaptureError(f"{picture}: ends before {at_s:g} s; choose a smaller --at")
 
 

@@ -1,6 +1,6 @@
 """The bundled small detector, for demo, self-test and pixel conformance.
 
-It was trained on drawn streets only; docs/bundled-detector.md gives its performance there and its limits.
+It was trained on drawn streets only; docs/bundled-detector.md has its figures and limits.
 """
 
 from __future__ import annotations

@@ -143,13 +143,7 @@ def check_camera(loaded: LoadedConfig) -> Finding:
 def _read_frames(loaded: LoadedConfig) -> tuple[list[Frame], float, float, bool]:
     """Frames of a second (or of a recording), the seconds they took, granted rate, whether live."""
     camera = loaded.config.camera
-    with open_source(
-        camera.source,
-        width=camera.width,
-        height=camera.height,
-        fps=camera.fps,
-        fourcc=camera.fourcc,
-    ) as source:
+    with open_source(camera) as source:
         frames: list[Frame] = []
         began = ended = time.monotonic()
         while ended - began < MEASURE_S:

@@ -7,21 +7,9 @@ import math
 import time
 from collections.abc import Callable
 
-from bikeped.capture import FrameGrabber, FrameSource, open_source
-from bikeped.config import CameraConfig
+from bikeped.capture import FrameGrabber, FrameSource
 from bikeped.pipeline.runtime import WorkerThread
 from bikeped.types import Frame
-
-
-def open_configured(camera: CameraConfig, source: str | None = None) -> FrameSource:
-    """The camera of the configuration, or `source` with its size and rate; raises CaptureError."""
-    return open_source(
-        camera.source if source is None else source,
-        width=camera.width,
-        height=camera.height,
-        fps=camera.fps,
-        fourcc=camera.fourcc,
-    )
 
 
 class Feed:

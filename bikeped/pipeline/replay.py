@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bikeped.capture import FrameSource, PacedSource
+from bikeped.capture import FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback.light import LightDriver, SimulatedLight
 from bikeped.overlay import VideoWriter
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector
-from bikeped.pipeline.feed import RecordedFeed, open_configured
+from bikeped.pipeline.feed import RecordedFeed
 from bikeped.pipeline.frame_result import FrameResultListener
 from bikeped.pipeline.replay_outputs import OVERLAY_SIZE, EventFile, OverlayVideo, ReplaySummary
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
@@ -102,7 +102,7 @@ def replay(
     camera made it (`own_camera`).
     `pages` are served while it runs; `serving` gets their address.
     """
-    source = open_configured(loaded.config.camera, recording)
+    source = open_source(loaded.config.camera, recording)
     with contextlib.closing(source):
         if source.live:
             raise BikepedError(f"{source.name}: is a camera, not a recording; use bikeped run")

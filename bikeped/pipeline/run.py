@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from bikeped import __version__
-from bikeped.capture import FrameGrabber, FrameSource, PacedSource
+from bikeped.capture import FrameGrabber, FrameSource, PacedSource, open_source
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
@@ -24,7 +24,7 @@ from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_stage import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
-from bikeped.pipeline.feed import LiveFeed, open_configured
+from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.runtime import Notifier, WorkerThread
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
@@ -126,7 +126,7 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
 
 
 def _open_camera(loaded: LoadedConfig) -> FrameSource:
-    source = open_configured(loaded.config.camera)
+    source = open_source(loaded.config.camera)
     # A recording in the camera's place is played at its own pace, as a rehearsal.
     return source if source.live else PacedSource(source)
 

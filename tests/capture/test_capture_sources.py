@@ -12,10 +12,11 @@ import pytest
 
 from bikeped.capture import ImageSource, JpegDecoder, NetworkSource, open_source
 from bikeped.capture.network import without_password
+from bikeped.config import CameraConfig
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT = 96, 64
-choose = functools.partial(open_source, width=WIDTH, height=HEIGHT, fps=10.0, fourcc="MJPG")
+choose = functools.partial(open_source, CameraConfig(width=WIDTH, height=HEIGHT, fps=10.0))
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 from shared_inputs import CLIP, missing
 
 from bikeped.capture import JpegDecoder, VideoSource, open_source
+from bikeped.config import CameraConfig
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT, FPS = 96, 64, 25.0
@@ -238,6 +239,6 @@ def test_a_whole_recording_ends_without_a_word(write_video, caplog):
 
 def test_open_source_takes_a_video_by_its_path(write_video):
     path = write_video("a.avi", "MJPG")
-    with open_source(str(path), width=3840, height=2160, fps=30.0, fourcc="MJPG") as source:
+    with open_source(CameraConfig(), str(path)) as source:
         assert isinstance(source, VideoSource)
         assert (source.width, source.fps) == (WIDTH, FPS)  # its own, not those asked of a camera

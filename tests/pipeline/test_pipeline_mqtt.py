@@ -73,7 +73,7 @@ async def test_a_broker_killed_in_mid_replay_costs_messages_and_no_time(
 ):
     broker = make_broker()
     source = Endless(small_jpegs)
-    monkeypatch.setattr("bikeped.pipeline.feed.open_source", lambda *a, **k: source)
+    monkeypatch.setattr("bikeped.pipeline.replay.open_source", lambda *a, **k: source)
     config = small_config(
         more=f"  # of mqtt\n  enabled: true\n  host: 127.0.0.1\n  port: {broker.port}\n"
         "  site: kill\n"

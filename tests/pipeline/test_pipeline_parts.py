@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pipeline_fakes import PATIENCE_S, Clock, FakeDetector
 
 from bikeped.capture import FrameGrabber, open_source
+from bikeped.config import CameraConfig
 from bikeped.errors import CaptureError
 from bikeped.pipeline.detection_stage import DetectionStage
 from bikeped.pipeline.feed import LiveFeed, RecordedFeed
@@ -82,7 +83,7 @@ def test_thirty_failures_a_second_are_a_line_every_ten(caplog):
 
 
 async def test_a_recorded_feed_gives_every_frame_and_then_the_end(make_clip):
-    source = open_source(str(make_clip("c.avi", 7)), width=96, height=64, fps=30, fourcc="MJPG")
+    source = open_source(CameraConfig(source=str(make_clip("c.avi", 7))))
     feed = RecordedFeed(source)
     numbers = []
     while (taken := await feed.next_frame()) is not None:

@@ -177,7 +177,7 @@ def test_a_camera_is_no_recording(small_config, monkeypatch):
         def close(self):
             pass
 
-    monkeypatch.setattr("bikeped.pipeline.feed.open_source", lambda *a, **k: Camera())
+    monkeypatch.setattr("bikeped.pipeline.replay.open_source", lambda *a, **k: Camera())
     with pytest.raises(BikepedError, match="bikeped run"):
         replay(load_config(small_config()), "/dev/video0", detector=FakeDetector())
 

@@ -37,13 +37,7 @@ def live_pictures(
     lens, centre = assumed_lens(camera.width, camera.height)
     guide = CaptureGuide(pattern, camera.width, camera.height, lens, centre)
     session = LiveSession(guide)
-    source = open_source(
-        camera.source,
-        width=camera.width,
-        height=camera.height,
-        fps=camera.fps,
-        fourcc=camera.fourcc,
-    )
+    source = open_source(camera)
     try:
         with LivePage(session, port=loaded.config.web.port) as page:
             screen.print(f"pictures go into {escape(str(folder))}; Ctrl-C when you have enough")
