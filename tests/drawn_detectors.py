@@ -10,7 +10,7 @@ import numpy as np
 from bikeped.detection.base import DetectionResult
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.rendering.clip import read_sidecar
-from bikeped.pipeline.detection_stage import DecodedFrame
+from bikeped.pipeline.detection_scheduler import DecodedFrame
 from bikeped.types import Detections
 
 

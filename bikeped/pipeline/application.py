@@ -21,7 +21,7 @@ from bikeped.errors import DetectorError
 from bikeped.feedback.light import LightDriver
 from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.feedback.speaker import Speaker
-from bikeped.pipeline.detection_stage import (
+from bikeped.pipeline.detection_scheduler import (
     MAX_INFLIGHT,
     DetectionStage,
     DetectorPool,

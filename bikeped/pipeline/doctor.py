@@ -6,6 +6,7 @@ service cannot work, `warn` that it works, but a person should look into it.
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import math
 import os
@@ -31,7 +32,7 @@ from bikeped.feedback.light import LAMP_COLOURS
 from bikeped.feedback.sounds import make_wav
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import load_detector_pool
-from bikeped.pipeline.detection_stage import DecodedFrame
+from bikeped.pipeline.detection_scheduler import DecodedFrame
 from bikeped.pipeline.track_and_decide import GroundMapper
 from bikeped.telemetry.mqtt_auth import load_credentials
 from bikeped.telemetry.mqtt_connection import BrokerConnection
@@ -83,8 +84,7 @@ def checks(*, light: bool = True, sound: bool = True) -> tuple[Check, ...]:
 
 def run_checks(loaded: LoadedConfig, todo: tuple[Check, ...]) -> Iterator[Finding]:
     """The findings one by one. A check that hangs is left behind in its thread."""
-    for check in todo:
-        yield _run_bounded(check, loaded)
+    return (_run_bounded(check, loaded) for check in todo)
 
 
 def _run_bounded(check: Check, loaded: LoadedConfig) -> Finding:
@@ -177,9 +177,8 @@ def check_model(loaded: LoadedConfig) -> Finding:
     detail = f"{detector.name}: {ms:.1f} ms a frame, loaded in {loaded_s:.1f} s"
     if loaded.config.detection.model == BUNDLED:
         detail = f"{detail}; {NOT_FOR_STREETS}"
-        return Finding(
-            "model", "warn", detail, "set detection.model to one trained on real streets"
-        )
+        remedy = "set detection.model to one trained on real streets"
+        return Finding("model", "warn", detail, remedy)
     if ms > 1e3 / camera.fps:
         remedy = "use the GPU (detection.providers) or a smaller model"
         return Finding("model", "warn", f"{detail}, slower than {camera.fps:g} frames/s", remedy)
@@ -190,13 +189,10 @@ def check_light(loaded: LoadedConfig) -> Finding:
     """Shows every colour briefly, then darkens the light."""
     feedback = loaded.config.feedback
     try:
-        light = open_light(feedback)
-        try:
+        with contextlib.closing(open_light(feedback)) as light:
             for colour in LAMP_COLOURS:
                 light.set(colour)
                 time.sleep(LAMP_S)
-        finally:
-            light.close()
     except BikepedError as error:
         return _device_error("light", error)
     if feedback.light == "simulated":
@@ -272,9 +268,7 @@ def check_disk(loaded: LoadedConfig) -> Finding:
     if audit.path is None:
         return Finding("disk", "skipped", "audit.path is null: no audit log")
     path = loaded.base_dir / audit.path
-    folder = path.parent
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
     free_mb = shutil.disk_usage(folder).free / MB
     detail = f"{path}: {free_mb:.0f} MB free"
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
@@ -293,9 +287,9 @@ def check_disk(loaded: LoadedConfig) -> Finding:
 def check_machine(_loaded: LoadedConfig, zones: Path = Path("/sys/class/thermal")) -> Finding:
     """Temperature, and the Jetson's power mode, as far as they can be read."""
     hottest = max(map(_celsius, zones.glob("thermal_zone*/temp")), default=-math.inf)
-    parts = [f"{hottest:.0f} degrees C"] if math.isfinite(hottest) else []
-    parts += [" ".join((_output_of("nvpmodel", "-q") or "").split())]
-    detail = "; ".join(filter(None, parts))
+    temperature = f"{hottest:.0f} degrees C" if math.isfinite(hottest) else ""
+    power_mode = " ".join((_output_of("nvpmodel", "-q") or "").split())
+    detail = "; ".join(filter(None, (temperature, power_mode)))
     if not detail:
         return Finding("machine", "skipped", "temperature and power mode cannot be read here")
     if hottest > HOT_C:
@@ -312,10 +306,7 @@ def _celsius(file: Path) -> float:
 
 def _output_of(program: str, *arguments: str) -> str | None:
     """What a program prints; None when it is not there or fails."""
-    path = shutil.which(program)
-    if path is None:
-        return None
-    command = [path, *arguments]
+    command = [program, *arguments]
     try:
         done = subprocess.run(command, capture_output=True, timeout=5, check=False, text=True)
     except (OSError, subprocess.TimeoutExpired):

@@ -70,11 +70,9 @@ class FaultMonitor:
         self._answered_s: float | None = None
 
     def decoded(self) -> None:
-        """A frame was decoded."""
         self._undecodable = None
 
     def not_decoded(self, error: Exception, now_s: float) -> None:
-        """A frame could not be decoded."""
         if self._undecodable is None:
             detail = f"frames do not decode ({error})"
             self._undecodable = _Since(Fault("camera", "camera.undecodable", detail), now_s)
@@ -86,11 +84,9 @@ class FaultMonitor:
         )
 
     def answered(self) -> None:
-        """The detector answered."""
         self._failing = None
 
     def not_answered(self, error: Exception, now_s: float) -> None:
-        """The detector failed on a frame."""
         if self._failing is None:
             self._failing = _Since(Fault("detector", "detector.error", str(error)), now_s)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bikeped.detection.base import DetectionResult
 from bikeped.overlay import GroundToFrame, OverlayData, ground_projector
-from bikeped.pipeline.detection_stage import DecodedFrame
+from bikeped.pipeline.detection_scheduler import DecodedFrame
 from bikeped.pipeline.track_and_decide import TrackAndDecide, TrackingResult
 from bikeped.types import Detections, Signal
 
@@ -24,17 +24,6 @@ class FrameResult:
     tracking: TrackingResult
     signal: Signal
     latency_ms: dict[str, float]  #: by stage, with `total` and `capture_age`
-
-
-@dataclass
-class FrameCounts:
-    """Totals since the start."""
-
-    received: int = 0
-    frames: int = 0  #: that led to a decision
-    undecodable: int = 0
-    failed: int = 0  #: the detector raised
-    out_of_order: int = 0
 
 
 class FrameResultListener(Protocol):

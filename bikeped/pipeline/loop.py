@@ -18,16 +18,15 @@ from collections.abc import Callable, Sequence
 
 from bikeped.detection.base import DetectionResult
 from bikeped.faults import Fault
-from bikeped.pipeline.detection_scheduler import DetectionScheduler
-from bikeped.pipeline.detection_stage import DecodedFrame, DetectionStage
+from bikeped.pipeline.detection_scheduler import (
+    DecodedFrame,
+    DetectionScheduler,
+    DetectionStage,
+    FrameCounts,
+)
 from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, FaultMonitor, Limits, StageHangError
 from bikeped.pipeline.feed import Feed
-from bikeped.pipeline.frame_result import (
-    FrameCounts,
-    FrameResult,
-    FrameResultListener,
-    stage_latencies,
-)
+from bikeped.pipeline.frame_result import FrameResult, FrameResultListener, stage_latencies
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import TrackAndDecide

@@ -22,7 +22,7 @@ from bikeped.feedback.signal_logic import fault_signal
 from bikeped.feedback.speaker import Speaker
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
-from bikeped.pipeline.detection_stage import FrameDetector
+from bikeped.pipeline.detection_scheduler import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.loop import Loop

@@ -135,14 +135,8 @@ class TrackAndDecide:
             captured_s, tracks.id, tracks.kind, self._ahead(tracks, age_s)
         )
         decided = time.perf_counter()
-        return TrackingResult(
-            points=points,
-            not_on_ground=not_on_ground,
-            tracks=tracks,
-            decision=decision,
-            track_ms=(tracked - began) * 1e3,
-            decide_ms=(decided - tracked) * 1e3,
-        )
+        track_ms, decide_ms = (tracked - began) * 1e3, (decided - tracked) * 1e3
+        return TrackingResult(points, not_on_ground, tracks, decision, track_ms, decide_ms)
 
     def _ahead(self, tracks: Tracks, age_s: float) -> FloatArray:
         """Positions [n, 2] in metres that the rule uses: predicted ahead if so configured."""

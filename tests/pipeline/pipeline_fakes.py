@@ -12,7 +12,7 @@ from bikeped.config import LoadedConfig, parse_config
 from bikeped.detection.base import DetectionResult
 from bikeped.faults import Fault, fault_texts
 from bikeped.feedback.signal_logic import SignalLogic
-from bikeped.pipeline.detection_stage import DecodedFrame, DetectionStage
+from bikeped.pipeline.detection_scheduler import DecodedFrame, DetectionStage
 from bikeped.pipeline.fault_monitor import Limits
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.loop import Loop

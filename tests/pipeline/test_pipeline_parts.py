@@ -15,7 +15,7 @@ from pipeline_fakes import PATIENCE_S, Clock, FakeDetector
 from bikeped.capture import FrameGrabber, open_source
 from bikeped.config import CameraConfig
 from bikeped.errors import CaptureError
-from bikeped.pipeline.detection_stage import DetectionStage
+from bikeped.pipeline.detection_scheduler import DetectionStage
 from bikeped.pipeline.feed import LiveFeed, RecordedFeed
 from bikeped.pipeline.runtime import Notifier, RateLimitedLogger, WorkerThread
 from bikeped.types import Frame

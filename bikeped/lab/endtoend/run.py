@@ -17,7 +17,7 @@ from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_c
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.pipeline.application import load_detector_pool
-from bikeped.pipeline.detection_stage import DetectionStage, FrameDetector
+from bikeped.pipeline.detection_scheduler import DetectionStage, FrameDetector
 from bikeped.pipeline.feed import RecordedFeed
 from bikeped.pipeline.frame_result import FrameResult
 from bikeped.pipeline.loop import Loop
