@@ -29,7 +29,7 @@ import msgspec
 
 from bikeped import __version__
 from bikeped.config import LoadedConfig, load_config, road_region
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.model_hash import sha256_of
 from bikeped.files import make_folder, write_whole

@@ -7,7 +7,6 @@ from bikeped.config.build import (
     rule_settings,
     tracker_settings,
 )
-from bikeped.config.calibration_file import load_calibration
 from bikeped.config.load import (
     LoadedConfig,
     config_hash,
@@ -17,39 +16,16 @@ from bikeped.config.load import (
     parse_config,
     parse_decision,
 )
-from bikeped.config.schema.decision import DecisionConfig
-from bikeped.config.schema.inputs import CameraConfig, Config
-from bikeped.config.schema.outputs import (
-    AuditConfig,
-    FeedbackConfig,
-    GpioConfig,
-    MqttConfig,
-    SoundConfig,
-    UsbConfig,
-    WebConfig,
-    is_loopback,
-)
-from bikeped.config.validate import known_keys
+from bikeped.config.schema import CameraConfig, DecisionConfig
 
 __all__ = [
-    "AuditConfig",
     "CameraConfig",
-    "Config",
     "DecisionConfig",
-    "FeedbackConfig",
-    "GpioConfig",
     "LoadedConfig",
-    "MqttConfig",
-    "SoundConfig",
-    "UsbConfig",
-    "WebConfig",
     "config_hash",
     "default_config_path",
     "framing",
     "ground_camera",
-    "is_loopback",
-    "known_keys",
-    "load_calibration",
     "load_config",
     "load_decision",
     "parse_config",

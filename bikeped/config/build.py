@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import math
 
-from bikeped.config.calibration_file import Calibration
-from bikeped.config.load import LoadedConfig
-from bikeped.config.schema.decision import DecisionConfig, TrackingConfig
+from bikeped.config.load import Calibration, LoadedConfig
+from bikeped.config.schema import DecisionConfig, TrackingConfig
 from bikeped.decision import RuleSettings
 from bikeped.errors import ConfigError, GeometryError
 from bikeped.geometry import Framing, GroundCamera, Lens, canonical_projection

@@ -1,4 +1,4 @@
-"""The JSON Schema and the page of all keys, both from `config/schema`.
+"""The JSON Schema and the page of all keys, both from `config/schema.py`.
 
 `python -m bikeped.config.docs docs/configuration.md` writes the page.
 """
@@ -13,14 +13,13 @@ from typing import Any
 
 import msgspec
 
-from bikeped.config.schema.base import sections
-from bikeped.config.schema.inputs import Config
+from bikeped.config.schema import Config, sections
 from bikeped.files import write_whole
 
 _INTRO = """\
 # Configuration
 
-<!-- Made by `python -m bikeped.config.docs docs/configuration.md` from bikeped/config/schema;
+<!-- Made by `python -m bikeped.config.docs docs/configuration.md` from bikeped/config/schema.py;
      change the descriptions there. -->
 
 Every key of `config.yaml`, in the order of the file. A key that is left out has its default. An

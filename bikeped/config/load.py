@@ -1,4 +1,4 @@
-"""Reading, overriding and hashing a configuration."""
+"""Reading, overriding and hashing a configuration and its `camera_calibration.json`."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 
-from bikeped.config.calibration_file import Calibration, load_calibration
-from bikeped.config.schema.decision import DecisionConfig
-from bikeped.config.schema.inputs import Config
+from bikeped.config.schema import Config, DecisionConfig
 from bikeped.config.strict_yaml import UNUSABLE, load_sections, load_yaml, one_line, read_text
-from bikeped.config.validate import check_calibration, check_together, to_config
-from bikeped.errors import ConfigError
+from bikeped.config.validate import check_together, to_config
+from bikeped.errors import CalibrationError, ConfigError
 from bikeped.models import BUNDLED
 
 _PATH_KEYS = (
@@ -23,6 +22,30 @@ _PATH_KEYS = (
     *("feedback.sound.chime", "feedback.sound.bell", "web.token_file"),
     *("mqtt.password_file", "mqtt.ca_file", "mqtt.cert_file", "mqtt.key_file"),
 )
+_Finite = Annotated[float, Meta(ge=-1e6, le=1e6)]
+_Side = Annotated[int, Meta(ge=1, le=100_000)]
+
+
+class Calibration(msgspec.Struct, frozen=True, kw_only=True):
+    """Intrinsics of one camera; lengths in pixels of the crop. Unknown keys are kept out."""
+
+    model: str
+    cx: _Finite
+    cy: _Finite
+    focal_length: Annotated[float, Meta(gt=0, le=1e6)]
+    fov_deg: Annotated[float, Meta(gt=0, le=360)]
+    radius_px: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    k1: _Finite = 0.0
+    k2: _Finite = 0.0
+    k3: _Finite = 0.0
+    k4: _Finite = 0.0
+    rms_error_px: _Finite | None = None
+    num_frames: int | None = None
+    num_points: int | None = None
+    frame_width: _Side | None = None
+    frame_height: _Side | None = None
+    pad_size: _Side | None = None
+    crop_size: _Side | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +103,7 @@ def parse_config(
     if config.camera.calibration is not None:
         file = base_dir / _expanded(config.camera.calibration)
         calibration, calibration_hash = load_calibration(file)
-        check_calibration(config, calibration, str(file))
+        _check_calibration(config, calibration, str(file))
     return LoadedConfig(
         config=config,
         source=source,
@@ -89,6 +112,47 @@ def parse_config(
         calibration=calibration,
         calibration_hash=calibration_hash,
     )
+
+
+def load_calibration(path: Path) -> tuple[Calibration, str]:
+    """The calibration and the SHA-256 of its file; CalibrationError names file, key and remedy."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CalibrationError(
+            f"{path}: cannot be read ({error.strerror}); correct camera.calibration, or set it "
+            "to null and give camera.radius_px and camera.fov_deg"
+        ) from error
+    try:
+        calibration = msgspec.json.decode(data, type=Calibration)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(
+            f"{path}: {error}; compare it with the camera_calibration.json that comes with bikeped"
+        ) from error
+    return calibration, hashlib.sha256(data).hexdigest()
+
+
+def _check_calibration(config: Config, calibration: Calibration, file: str) -> None:
+    """Checks that a calibration was made with the configured framing; ConfigError names `file`."""
+    camera = config.camera
+    for key, measured, configured in (
+        ("crop_size", calibration.crop_size, camera.crop_size),
+        ("pad_size", calibration.pad_size, camera.pad_size),
+        ("width", calibration.frame_width, camera.width),
+        ("height", calibration.frame_height, camera.height),
+    ):
+        if measured is not None and measured != configured:
+            raise ConfigError(
+                f"{file}: does not fit: camera.{key} is {configured}, the calibration was made "
+                f"with {measured}; set camera.{key}: {measured} or calibrate again"
+            )
+    if camera.crop_size is not None and not (
+        0 <= calibration.cx <= camera.crop_size and 0 <= calibration.cy <= camera.crop_size
+    ):
+        raise ConfigError(
+            f"{file}: does not fit: centre ({calibration.cx:g}, {calibration.cy:g}) lies outside "
+            f"the crop of {camera.crop_size} px; calibrate again with this crop"
+        )
 
 
 def load_decision(path: Path, overrides: Sequence[str] = ()) -> DecisionConfig:

@@ -17,7 +17,7 @@ import msgspec
 
 from bikeped import __version__
 from bikeped.config.load import LoadedConfig
-from bikeped.config.schema.decision import DecisionConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.models import model_file
 
 #: What turns detections into a state on the pole; the simulation runs the same rule and tracker.

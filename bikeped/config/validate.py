@@ -9,10 +9,7 @@ from typing import Any
 
 import msgspec
 
-from bikeped.config.calibration_file import Calibration
-from bikeped.config.schema.base import sections
-from bikeped.config.schema.inputs import Config
-from bikeped.config.schema.outputs import is_loopback
+from bikeped.config.schema import Config, is_loopback, sections
 from bikeped.config.strict_yaml import one_line
 from bikeped.errors import ConfigError
 
@@ -55,29 +52,6 @@ def check_together(config: Config, source: str) -> None:
         raise ConfigError(
             f"{source}: web.host: {one_line(web.host)} can be reached by others, who would see the "
             "camera's picture; set web.token_file too, or web.host: 127.0.0.1"
-        )
-
-
-def check_calibration(config: Config, calibration: Calibration, file: str) -> None:
-    """Checks that a calibration was made with the configured framing; ConfigError names `file`."""
-    camera = config.camera
-    for key, measured, configured in (
-        ("crop_size", calibration.crop_size, camera.crop_size),
-        ("pad_size", calibration.pad_size, camera.pad_size),
-        ("width", calibration.frame_width, camera.width),
-        ("height", calibration.frame_height, camera.height),
-    ):
-        if measured is not None and measured != configured:
-            raise ConfigError(
-                f"{file}: does not fit: camera.{key} is {configured}, the calibration was made "
-                f"with {measured}; set camera.{key}: {measured} or calibrate again"
-            )
-    if camera.crop_size is not None and not (
-        0 <= calibration.cx <= camera.crop_size and 0 <= calibration.cy <= camera.crop_size
-    ):
-        raise ConfigError(
-            f"{file}: does not fit: centre ({calibration.cx:g}, {calibration.cy:g}) lies outside "
-            f"the crop of {camera.crop_size} px; calibrate again with this crop"
         )
 
 

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.errors import DetectorError
 from bikeped.types import Kind, KindArray
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection.base import Detector
 from bikeped.detection.model_hash import verify_sha256
 from bikeped.errors import DetectorError

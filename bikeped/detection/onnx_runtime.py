@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime as ort
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.model_metadata import (
     ModelMetadata,

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection.cuda import Cuda
 from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.model_metadata import (

@@ -27,7 +27,7 @@ The machine counts good frames: new decisions without a fault, in a row. It star
 
 from __future__ import annotations
 
-from bikeped.config import FeedbackConfig
+from bikeped.config.schema import FeedbackConfig
 from bikeped.faults import Fault
 from bikeped.types import Colour, Signal, Sound, State
 

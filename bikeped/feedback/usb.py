@@ -24,7 +24,7 @@ import importlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from bikeped.config import UsbConfig
+from bikeped.config.schema import UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback.light import Lamp, assign_lamps
 from bikeped.types import Colour

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from bikeped.config import AuditConfig
+from bikeped.config.schema import AuditConfig
 from bikeped.faults import Fault
 from bikeped.telemetry.builders import encode_line
 from bikeped.telemetry.schema import EventHeader, EventLine

@@ -6,7 +6,7 @@ import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bikeped.config import MqttConfig
+from bikeped.config.schema import MqttConfig
 from bikeped.errors import TelemetryError
 
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from bikeped.config import MqttConfig
+from bikeped.config.schema import MqttConfig
 from bikeped.telemetry.mqtt_auth import Credentials
 
 

@@ -64,7 +64,7 @@ def _one_after_another(clip: Path, model: Path) -> float:
     import numpy as np
     import onnxruntime as ort
 
-    from bikeped.config.schema.inputs import DetectionConfig
+    from bikeped.config.schema import DetectionConfig
     from bikeped.detection import load_detector
 
     width, height = load_detector(DetectionConfig(model=str(model)), Path()).input_size

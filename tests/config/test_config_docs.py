@@ -3,8 +3,8 @@
 import re
 from pathlib import Path
 
-from bikeped.config import known_keys
 from bikeped.config.docs import main, markdown
+from bikeped.config.validate import known_keys
 
 PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
 

@@ -13,19 +13,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.config import (
-    Config,
     LoadedConfig,
     config_hash,
     default_config_path,
     framing,
     ground_camera,
-    known_keys,
-    load_calibration,
     load_config,
     parse_config,
     rule_settings,
     tracker_settings,
 )
+from bikeped.config.load import load_calibration
+from bikeped.config.schema import Config
+from bikeped.config.validate import known_keys
 from bikeped.errors import BikepedError, CalibrationError, ConfigError
 
 TOP = Path(__file__).parents[2]

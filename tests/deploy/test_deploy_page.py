@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from bikeped.config import framing, load_config
-from bikeped.config.schema.inputs import Config
+from bikeped.config.schema import Config
 from bikeped.errors import GeometryError
 from bikeped.faults import Fault
 from bikeped.feedback.light import NOT_REFRESHED

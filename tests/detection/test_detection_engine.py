@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection import trt_engine as engine_module
 from bikeped.detection.cuda import Cuda

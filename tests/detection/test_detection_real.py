@@ -15,7 +15,7 @@ import pytest
 from onnx import helper, numpy_helper
 from shared_inputs import CLIP, MODEL, missing
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.weights import first_layer
 from bikeped.types import Kind

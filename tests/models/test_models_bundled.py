@@ -10,7 +10,7 @@ import pytest
 
 from bikeped.cli.main import main
 from bikeped.config import load_config, road_region
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.model_hash import sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bikeped.config import AuditConfig
+from bikeped.config.schema import AuditConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import event_line, rfc3339

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from bikeped.config import MqttConfig
+from bikeped.config.schema import MqttConfig
 from bikeped.telemetry.mqtt import MqttPublisher
 
 FAST = (0.01, 0.05)  # seconds between attempts, so that tests do not wait
@@ -110,7 +110,7 @@ async def test_the_will_says_offline_when_the_client_is_cut_off(broker, listen, 
 async def test_the_will_says_offline_when_the_process_is_killed(broker, listen):
     program = (
         "import sys, threading\n"
-        "from bikeped.config.schema.inputs import MqttConfig\n"
+        "from bikeped.config.schema import MqttConfig\n"
         "from bikeped.telemetry.mqtt import MqttPublisher\n"
         "mqtt = MqttPublisher(MqttConfig(port=int(sys.argv[1]), site='killed'))\n"
         "mqtt.start()\n"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bikeped.config import MqttConfig
+from bikeped.config.schema import MqttConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.mqtt import MqttPublisher
 from bikeped.telemetry.mqtt_auth import load_credentials, sends_password_in_clear

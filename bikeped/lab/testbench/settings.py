@@ -18,7 +18,7 @@ import msgspec
 from msgspec import Meta
 
 from bikeped.config import DecisionConfig, LoadedConfig, ground_camera
-from bikeped.config.schema.base import Section
+from bikeped.config.schema import Section
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.experiments.latency import delay_frames

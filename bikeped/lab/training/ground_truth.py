@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection.classes import WITH_RIDER
 from bikeped.detection.riders import join_riders
 from bikeped.lab.training.coco import CocoData, CocoImage, CocoObject

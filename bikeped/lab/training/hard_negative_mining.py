@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.geometry.boxes import iou_matrix
 from bikeped.lab.process_pool import worker_pool

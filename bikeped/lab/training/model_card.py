@@ -17,7 +17,7 @@ import numpy as np
 
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.config import LoadedConfig
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection import Detector, load_detector
 from bikeped.geometry import road_region
 from bikeped.geometry.boxes import iou_matrix

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bikeped.config import load_config
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.lab.rendering import DrawnObject, scene_camera
 from bikeped.lab.training.model_card import (
     DetectionRecord,

@@ -11,7 +11,7 @@ import pytest
 from coco_sets import CATEGORIES, annotation, edit, write_set
 from shared_inputs import CLIP, MODEL, missing
 
-from bikeped.config.schema.inputs import DetectionConfig
+from bikeped.config.schema import DetectionConfig
 from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.errors import DataSetError, DetectorError

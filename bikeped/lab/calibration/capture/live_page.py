@@ -11,7 +11,7 @@ from types import TracebackType
 
 from aiohttp import hdrs, web
 
-from bikeped.config import WebConfig
+from bikeped.config.schema import WebConfig
 from bikeped.lab.calibration.capture.live_session import LiveSession
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.web.security import load_access_policy

@@ -1,0 +1,400 @@
+"""Every key of `config.yaml`: its type, range and default, and below it what it means.
+
+The texts below the keys go into `docs/configuration.md` and `bikeped config schema`. Settings that
+the paper gives in frames stay in frames here and become seconds once, at `decision.nominal_fps`.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+# Finite by construction: msgspec refuses NaN only where a bound is given, so every float has one.
+Radial = Annotated[float, Meta(ge=-10, le=10)]
+Projection = Literal[
+    "equidistant",
+    "equisolid",
+    "stereographic",
+    "orthographic",
+    "perspective",
+    "linear",
+    "equalarea",
+]
+Ratio = Annotated[float, Meta(ge=0, le=1)]
+Line = Annotated[str, Meta(min_length=1)] | Annotated[int, Meta(ge=0, le=4095)]
+
+
+class Section(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=False
+):
+    """Base of all sections: immutable, no unknown keys."""
+
+
+class CameraConfig(Section, frozen=True):
+    """The camera: its source, its lens, and its pose above the ground."""
+
+    source: Annotated[str, Meta(min_length=1)] = "/dev/video0"
+    """V4L2 device, video file, folder of images, or rtsp:// or http:// address"""
+    width: Annotated[int, Meta(ge=16, le=16384)] = 3840
+    """sensor width requested from the camera, pixels"""
+    height: Annotated[int, Meta(ge=16, le=16384)] = 2160
+    """sensor height requested from the camera, pixels"""
+    fps: Annotated[float, Meta(ge=1, le=240)] = 30.0
+    """frame rate requested from the camera, frames per second"""
+    fourcc: Annotated[str, Meta(min_length=4, max_length=4)] = "MJPG"
+    """V4L2 pixel format; MJPG is passed undecoded"""
+    calibration: str | None = None
+    """calibration file with projection, centre, focal length and radial terms, relative to this
+    file; null uses only the keys below"""
+    projection: Projection | None = None
+    """lens model; linear is equidistant, equalarea is equisolid, perspective is an ordinary lens;
+    null takes the calibration's, or else equidistant"""
+    fov_deg: Annotated[float, Meta(gt=0, le=300)] | None = None
+    """field of view, degrees; null takes the calibration's"""
+    radius_px: Annotated[float, Meta(gt=0, le=100000)] | None = None
+    """image circle radius at the edge of the field of view, crop pixels; gives the focal length;
+    null takes the calibration's focal length"""
+    cx: Annotated[float, Meta(ge=-100000, le=100000)] | None = None
+    """optical centre u in the crop, pixels; null takes the calibration's, or else the middle"""
+    cy: Annotated[float, Meta(ge=-100000, le=100000)] | None = None
+    """optical centre v in the crop, pixels; null takes the calibration's, or else the middle"""
+    k1: Radial | None = None
+    """radial term of theta^3; null: calibration"""
+    k2: Radial | None = None
+    """radial term of theta^5; null: calibration"""
+    k3: Radial | None = None
+    """radial term of theta^7; null: calibration"""
+    k4: Radial | None = None
+    """radial term of theta^9; null: calibration"""
+    pad_size: Annotated[int, Meta(ge=16, le=32768)] | None = 3840
+    """side of the black square that the frame is centred in, pixels; null: none"""
+    crop_size: Annotated[int, Meta(ge=16, le=32768)] | None = 3500
+    """side of the square cut from its middle, pixels; null: none"""
+    height_m: Annotated[float, Meta(gt=0, le=100)] = 3.6576
+    """height of the lens above the ground, metres"""
+    pitch_deg: Annotated[float, Meta(ge=-90, le=90)] = 0.0
+    """pitch, degrees; 0 is level, negative looks down"""
+    heading_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    """turns the ground frame to the right of the optical axis, degrees; 0 keeps x forward"""
+    table_step_px: Annotated[int, Meta(ge=2, le=64)] = 8
+    """spacing of the ground table's lattice, crop pixels"""
+    stale_after_s: Annotated[float, Meta(gt=0, le=60)] = 0.5
+    """no frame for this long is a FAULT and a new capture, seconds"""
+    hang_after_s: Annotated[float, Meta(ge=1, le=600)] = 15.0
+    """a read that has not returned for this long ends the process, and systemd starts it again,
+    seconds"""
+
+
+class DetectionConfig(Section, frozen=True):
+    """The detector: model file, output layout, and which detections are kept."""
+
+    model: str | None = None
+    """model file, .onnx or .engine, relative to this file; bundled: the small one that comes with
+    bikeped, trained on drawn streets only, for demo and self-test, never for a street; null:
+    none"""
+    sha256: Annotated[str, Meta(pattern="^[0-9a-fA-F]{64}$")] | None = None
+    """SHA-256 of the model file, refused when different; null: any"""
+    layout: Literal["auto", "yolov5", "yolov8", "end2end", "yolox", "yolox-decoded"] = "auto"
+    """output layout: yolov5 also v7; yolov8 also v9, v11, v12; end2end also v10 and 26; auto tells
+    them apart by metadata and shapes"""
+    preprocess: Literal["auto", "ultralytics", "yolox", "yolox-legacy"] = "auto"
+    """ultralytics: RGB/255, centred letterbox; yolox: BGR 0..255, top-left; yolox-legacy (before
+    0.1.1): RGB/255, ImageNet mean and deviation, top-left"""
+    region: Literal["auto", "road", "frame"] = "auto"
+    """part of the frame that the model gets; road: where road users within decision.max_range_m can
+    be, by height and pitch of the camera; frame: all; auto: road where the model's input can have
+    that height, which is faster, else frame"""
+    confidence: Annotated[float, Meta(ge=0.001, le=1)] = 0.1
+    """lowest confidence of a detection that is kept"""
+    iou: Annotated[float, Meta(ge=0.01, le=1)] = 0.45
+    """overlap above which the less confident of two boxes of one class is dropped"""
+    merge_overlap: Annotated[float, Meta(ge=0.5, le=1)] = 0.75
+    """box voting: a kept box becomes the mean, weighted by confidence, of the boxes of its kind
+    that overlap it this much, which reduces box jitter; 1 leaves every box as it is"""
+    max_detections: Annotated[int, Meta(ge=1, le=10000)] = 300
+    """largest number of detections kept of one frame"""
+    pedestrian: tuple[str, ...] = ("person", "pedestrian")
+    """model class names that are pedestrians"""
+    cyclist: tuple[str, ...] = ("bicycle", "motorcycle", "cyclist")
+    """model class names that are cyclists"""
+    vehicle: tuple[str, ...] = ("car", "bus", "truck", "vehicle")
+    """model class names that are vehicles"""
+    rider_overlap: Annotated[float, Meta(ge=0, le=1)] = 0.4
+    """share of a person's box, from the waist down, that a cyclist's box must cover for the two to
+    be one rider; 1 never joins them"""
+    providers: Annotated[tuple[Literal["tensorrt", "cuda", "cpu"], ...], Meta(min_length=1)] = (
+        "tensorrt",
+        "cuda",
+        "cpu",
+    )
+    """ONNX Runtime execution providers in order; those not present are skipped"""
+    engine_cache: Annotated[str, Meta(min_length=1)] = "~/.cache/bikeped/engines"
+    """folder for TensorRT engines built from ONNX"""
+    threads: Annotated[int, Meta(ge=0, le=256)] = 0
+    """CPU threads for inference; 0 lets the runtime choose, and runs two copies of the model with
+    half of the cores each on a recording"""
+    silent_after_s: Annotated[float, Meta(gt=0, le=60)] = 0.5
+    """no detector answer for this long is a FAULT, seconds"""
+
+
+class TrackingConfig(Section, frozen=True):
+    """The tracker, in ground metres."""
+
+    match_radius_m: Annotated[float, Meta(gt=0, le=50)] = 3.0
+    """largest distance between a detection and the track that it is matched with, m"""
+    max_unseen_s: Annotated[float, Meta(ge=0, le=60)] = 10.0
+    """an unseen track coasts at constant velocity this long, s"""
+    velocity_weight: Annotated[float, Meta(gt=0, le=1)] = 0.15
+    """weight of the newest step in the smoothed velocity, per nominal frame; the paper's simulation
+    has 0.5, with which the noise of real boxes carries lost tracks far away"""
+    position_weight: Annotated[float, Meta(gt=0, le=1)] = 0.2
+    """weight of a detection against the predicted position of its track, per nominal frame; with 1,
+    as in the paper's simulation, a track jumps as its boxes do, which can hide that a pair closes
+    in"""
+    speed_window_frames: Annotated[int, Meta(ge=1, le=60)] = 4
+    """speed and velocity are the displacement over these nominal frames: a cyclist's in the
+    stopping distance, and the published one"""
+    history_frames: Annotated[int, Meta(ge=2, le=300)] = 30
+    """positions kept and published of each track"""
+    confirm_hits: Annotated[int, Meta(ge=1, le=30)] = 2
+    """matches before a track counts as present"""
+    rider_radius_m: Annotated[float, Meta(ge=0, le=5)] = 1.0
+    """a person without a track, this near to a cyclist's track without a detection, is that
+    cyclist, and the reverse; 0: never, m"""
+    max_range_m: Annotated[float, Meta(gt=0, le=1000)] = 60.0
+    """detections farther from the camera are not tracked, m"""
+    max_speed_pedestrian_mps: Annotated[float, Meta(gt=0, le=100)] = 6.0
+    """speed gate of pedestrians, m/s"""
+    max_speed_cyclist_mps: Annotated[float, Meta(gt=0, le=100)] = 20.0
+    """speed gate of cyclists, m/s"""
+    max_speed_vehicle_mps: Annotated[float, Meta(gt=0, le=100)] = 40.0
+    """speed gate of vehicles, m/s"""
+    position_noise_m: Annotated[float, Meta(ge=0, le=10)] = 0.75
+    """measurement noise that the speed gate allows on top of the speed, m"""
+
+
+class DecisionConfig(Section, frozen=True):
+    """The three-stage rule. The defaults are the paper's selected configuration."""
+
+    rule: Literal["pairwise", "naive", "ttc", "distance"] = "pairwise"
+    """closing check: the paper's pairwise one, or a baseline"""
+    memory_frames: Annotated[int, Meta(ge=0, le=3000)] = 58
+    """N: a cyclist is remembered this many nominal frames"""
+    d_min_m: Annotated[float, Meta(ge=0, le=100)] = 1.9
+    """nearest pair distance that can alert, m"""
+    d_max_m: Annotated[float, Meta(gt=0, le=100)] = 24.8
+    """farthest pair distance that can alert, m"""
+    min_displacement_m: Annotated[float, Meta(ge=0, le=10)] = 0.147
+    """smallest displacement of the cyclist over the lookback that counts as moving, m"""
+    lookback_frames: Annotated[int, Meta(ge=1, le=60)] = 2
+    """k: the lookback, in nominal frames"""
+    max_range_m: Annotated[float, Meta(gt=0, le=1000)] = 25.0
+    """pairs farther from the camera are not evaluated, m"""
+    speed_adaptive: bool = True
+    """raise d_max to the cyclist's stopping distance"""
+    reaction_s: Annotated[float, Meta(ge=0, le=10)] = 0.84
+    """cyclist's reaction time in the stopping distance, s"""
+    deceleration_mps2: Annotated[float, Meta(gt=0, le=20)] = 1.96
+    """cyclist's deceleration in the stopping distance, m/s^2"""
+    ttc_s: Annotated[float, Meta(gt=0, le=60)] = 3.0
+    """time to collision below which rule ttc fires, s"""
+    nominal_fps: Annotated[float, Meta(ge=1, le=240)] = 30.0
+    """turns settings in frames into seconds, once"""
+
+
+class LatencyConfig(Section, frozen=True):
+    """Compensation of the time between capture and decision."""
+
+    compensation: Literal["off", "measured", "frames"] = "off"
+    """off; predict ahead by the measured capture age; or by a fixed number of frames"""
+    frames: Annotated[int, Meta(ge=0, le=60)] = 0
+    """nominal frames to predict ahead, with compensation: frames"""
+    order: Literal[1, 2] = 1
+    """1 predicts with velocity, 2 also with acceleration (worse, says the paper)"""
+    max_s: Annotated[float, Meta(ge=0, le=5)] = 0.5
+    """never predict farther ahead than this, seconds"""
+    camera_offset_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
+    """part of the camera's delay that its time stamp does not show, seconds"""
+
+
+class GpioConfig(Section, frozen=True):
+    """A light on GPIO lines."""
+
+    chip: Annotated[str, Meta(min_length=1)] = "tegra234-gpio"
+    """chip by label, name or path, e.g. tegra234-gpio"""
+    red: Line | None = None
+    """line name or offset; null: not wired"""
+    orange: Line | None = None
+    """line name or offset; null: not wired"""
+    green: Line | None = None
+    """line name or offset; null: not wired"""
+    blue: Line | None = None
+    """line name or offset; null: not wired"""
+    active_low: bool = False
+    """a low line lights the lamp"""
+
+
+class UsbConfig(Section, frozen=True):
+    """A USB light or relay board."""
+
+    device: Literal["blink1", "luxafor", "relay"] = "relay"
+    """blink1: ThingM blink(1); luxafor: Luxafor Flag; relay: HID relay board 16c0:05df, one relay a
+    colour"""
+    serial: str | None = None
+    """serial number when several are plugged in; null: first"""
+    relay_red: Annotated[int, Meta(ge=0, le=8)] = 1
+    """relay of red; 0: not wired"""
+    relay_orange: Annotated[int, Meta(ge=0, le=8)] = 2
+    """relay of orange; 0: not wired"""
+    relay_green: Annotated[int, Meta(ge=0, le=8)] = 3
+    """relay of green; 0: not wired"""
+    relay_blue: Annotated[int, Meta(ge=0, le=8)] = 4
+    """relay of blue; 0: not wired"""
+
+
+class SoundConfig(Section, frozen=True):
+    """The speaker."""
+
+    enabled: bool = False
+    """play chime and bell"""
+    device: Annotated[str, Meta(min_length=1)] = "default"
+    """ALSA device, as aplay -D takes it"""
+    volume: Ratio = 0.8
+    """0 is silent, 1 is full scale"""
+    chime: str | None = None
+    """WAV file of the chime; null: bikeped's own"""
+    bell: str | None = None
+    """WAV file of the bell; null: bikeped's own"""
+    chime_cooldown_s: Annotated[float, Meta(ge=0, le=3600)] = 5.0
+    """shortest time between two chimes, seconds"""
+    bell_cooldown_s: Annotated[float, Meta(ge=0, le=3600)] = 1.5
+    """shortest time between two bells; while ALERT lasts the bell repeats, s"""
+
+
+class FeedbackConfig(Section, frozen=True):
+    """The light and the speaker."""
+
+    light: Literal["simulated", "gpio", "usb"] = "simulated"
+    """simulated writes to the log"""
+    blink_hz: Annotated[float, Meta(gt=0, le=10)] = 2.0
+    """blinking of ALERT's red, flashes per second"""
+    fault_blink_hz: Annotated[float, Meta(gt=0, le=10)] = 0.5
+    """blinking of FAULT's orange, flashes per second"""
+    hold_alert_s: Annotated[float, Meta(ge=0, le=10)] = 1.0
+    """the light keeps ALERT at least this long, so that an alert of one frame is visible, s"""
+    recover_frames: Annotated[int, Meta(ge=1, le=300)] = 5
+    """good frames in a row before the light leaves FAULT"""
+    gpio: GpioConfig = msgspec.field(default_factory=GpioConfig)
+    usb: UsbConfig = msgspec.field(default_factory=UsbConfig)
+    sound: SoundConfig = msgspec.field(default_factory=SoundConfig)
+
+
+class MqttConfig(Section, frozen=True):
+    """Telemetry by MQTT."""
+
+    enabled: bool = False
+    """publish to the broker"""
+    host: Annotated[str, Meta(min_length=1)] = "localhost"
+    """broker's name or address"""
+    port: Annotated[int, Meta(ge=1, le=65535)] = 1883
+    """broker's port"""
+    site: Annotated[str, Meta(pattern="^[^/+#\\x00]+$", max_length=64)] = "crossing"
+    """the <site> of the topics bikeped/<site>/..."""
+    qos: Annotated[int, Meta(ge=0, le=2)] = 1
+    """quality of service of state and health"""
+    publish_interval_s: Annotated[float, Meta(ge=0.01, le=3600)] = 0.1
+    """time between two track messages, seconds"""
+    health_interval_s: Annotated[float, Meta(ge=0.1, le=3600)] = 10.0
+    """time between two health messages, seconds"""
+    keepalive_s: Annotated[int, Meta(ge=1, le=3600)] = 15
+    """MQTT keep-alive, seconds"""
+    username: str | None = None
+    """user name; null: none"""
+    password_file: str | None = None
+    """file whose first line is the password; null: none"""
+    tls: bool = False
+    """encrypt the connection"""
+    ca_file: str | None = None
+    """CA certificates; null: the system's"""
+    cert_file: str | None = None
+    """client certificate; null: none"""
+    key_file: str | None = None
+    """key of the client certificate"""
+    home_assistant: bool = False
+    """announce the entities for Home Assistant's discovery"""
+    discovery_prefix: Annotated[str, Meta(min_length=1)] = "homeassistant"
+    """Home Assistant's discovery prefix"""
+
+
+class WebConfig(Section, frozen=True):
+    """The HTTP server: the pages, `/metrics` and `/healthz`."""
+
+    enabled: bool = False
+    """serve the pages, /metrics and /healthz"""
+    host: Annotated[str, Meta(min_length=1)] = "127.0.0.1"
+    """address to bind; any but this machine's own (127.0.0.1, ::1, localhost) needs
+    web.token_file"""
+    port: Annotated[int, Meta(ge=0, le=65535)] = 8080
+    """port to bind; 0: any free one"""
+    token_file: str | None = None
+    """file whose first line is the token or password, 12 characters or more, that everything but
+    the login page asks for; null: none"""
+    allowed_hosts: Annotated[tuple[str, ...], Meta(max_length=32)] = ()
+    """further names under which browsers may open the pages, e.g. pole7.lan"""
+    max_connections: Annotated[int, Meta(ge=4, le=1000)] = 64
+    """open connections; more are turned away"""
+    max_viewers: Annotated[int, Meta(ge=1, le=100)] = 8
+    """live pages at a time; more are turned away"""
+    stream_fps: Annotated[float, Meta(gt=0, le=30)] = 10.0
+    """pictures per second of the live page, while it is open"""
+    stream_width: Annotated[int, Meta(ge=160, le=3840)] = 960
+    """width of the live page's picture, pixels"""
+
+
+class AuditConfig(Section, frozen=True):
+    """The audit log: one JSON line a frame."""
+
+    path: str | None = None
+    """file to append to; null writes no audit log"""
+    max_mb: Annotated[float, Meta(ge=0.01, le=100000)] = 100.0
+    """size at which the file is rotated, MB"""
+    keep: Annotated[int, Meta(ge=1, le=1000)] = 10
+    """rotated files that are kept"""
+    min_free_mb: Annotated[float, Meta(ge=0, le=1000000)] = 500.0
+    """nothing is written with less free disk than this, MB"""
+
+
+class Config(Section, frozen=True):
+    """The whole configuration."""
+
+    camera: CameraConfig = msgspec.field(default_factory=CameraConfig)
+    detection: DetectionConfig = msgspec.field(default_factory=DetectionConfig)
+    tracking: TrackingConfig = msgspec.field(default_factory=TrackingConfig)
+    decision: DecisionConfig = msgspec.field(default_factory=DecisionConfig)
+    feedback: FeedbackConfig = msgspec.field(default_factory=FeedbackConfig)
+    mqtt: MqttConfig = msgspec.field(default_factory=MqttConfig)
+    web: WebConfig = msgspec.field(default_factory=WebConfig)
+    audit: AuditConfig = msgspec.field(default_factory=AuditConfig)
+    latency: LatencyConfig = msgspec.field(default_factory=LatencyConfig)
+
+
+def sections(
+    struct: type[msgspec.Struct], path: str = ""
+) -> Iterator[tuple[str, type[msgspec.Struct]]]:
+    """(path, section) of a section (its own path is `path`) and of all sections in it, in order."""
+    yield path, struct
+    for field in msgspec.structs.fields(struct):
+        if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
+            yield from sections(field.type, f"{path}.{field.name}" if path else field.name)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether `host`, a name or an address, is reachable from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
