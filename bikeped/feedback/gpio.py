@@ -15,7 +15,7 @@ from typing import Any
 
 from bikeped.config.schema import GpioConfig
 from bikeped.errors import FeedbackError
-from bikeped.feedback.light import Lamp, assign_lamps
+from bikeped.feedback.light import LAMP_COLOURS, Lamp, assign_lamps
 from bikeped.types import Colour
 
 SECTION = "feedback.gpio"
@@ -23,13 +23,7 @@ SECTION = "feedback.gpio"
 
 def gpio_lamps(config: GpioConfig) -> dict[Colour, Lamp]:
     """The line of each colour; raises FeedbackError when the wiring cannot show what it must."""
-    wired: dict[Colour, Lamp] = {
-        Colour.RED: config.red,
-        Colour.ORANGE: config.orange,
-        Colour.GREEN: config.green,
-        Colour.BLUE: config.blue,
-    }
-    return assign_lamps(wired, SECTION)
+    return assign_lamps({c: getattr(config, c.value) for c in LAMP_COLOURS}, SECTION)
 
 
 class GpioLight:
@@ -110,8 +104,7 @@ def _find_chip(gpiod: Any, wanted: str, chips: Iterable[str] | None) -> str:
         return wanted
     if chips is None:
         chips = sorted(str(path) for path in Path("/dev").glob("gpiochip*"))
-    seen: list[str] = []
-    found: list[str] = []
+    seen, found = [], []
     for path in chips:
         if not gpiod.is_gpiochip_device(path):
             continue

@@ -117,8 +117,7 @@ class LightDriver:
         self.name = name
         self._open_light = open_light
         self._watchdog_signal = fault_signal((NOT_REFRESHED,), fault_blink_hz)
-        self._watchdog_s = watchdog_s
-        self._clock = clock
+        self._watchdog_s, self._clock = watchdog_s, clock
 
         # Shared with the caller, guarded by the condition's lock.
         self._changed = threading.Condition()
@@ -262,10 +261,9 @@ class LightDriver:
             return
         try:
             self._call(light.close)
-        except FeedbackError as error:
-            _log.debug("light: closing failed: %s", error)
         except Exception as error:  # noqa: BLE001 - as in _apply
-            _log.warning("light: closing failed: %s: %s", type(error).__name__, error)
+            level = logging.DEBUG if isinstance(error, FeedbackError) else logging.WARNING
+            _log.log(level, "light: closing failed: %s: %s", type(error).__name__, error)
 
     def _run(self) -> None:
         while True:

@@ -22,11 +22,12 @@ import contextlib
 import errno
 import importlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from bikeped.config.schema import UsbConfig
 from bikeped.errors import FeedbackError
-from bikeped.feedback.light import Lamp, assign_lamps
+from bikeped.feedback.light import LAMP_COLOURS, Lamp, assign_lamps
 from bikeped.types import Colour
 
 SECTION = "feedback.usb"
@@ -47,21 +48,12 @@ _RGB: dict[Colour, tuple[int, int, int]] = {
 }
 
 _IDS = {"blink1": (0x27B8, 0x01ED), "luxafor": (0x04D8, 0xF372), "relay": (0x16C0, 0x05DF)}
-_NAMES = {
-    "blink1": "blink(1) 27b8:01ed",
-    "luxafor": "Luxafor Flag 04d8:f372",
-    "relay": "HID relay board 16c0:05df",
-}
+_NAMES = {"blink1": "blink(1)", "luxafor": "Luxafor Flag", "relay": "HID relay board"}
 
 
 def relay_lamps(config: UsbConfig) -> dict[Colour, Lamp]:
     """The relay of each colour, 1 to 8, None for dark; FeedbackError when red is not wired."""
-    wired = {
-        Colour.RED: config.relay_red or None,
-        Colour.ORANGE: config.relay_orange or None,
-        Colour.GREEN: config.relay_green or None,
-        Colour.BLUE: config.relay_blue or None,
-    }
+    wired = {c: getattr(config, f"relay_{c.value}") or None for c in LAMP_COLOURS}
     return assign_lamps(wired, SECTION)
 
 
@@ -72,7 +64,8 @@ class UsbLight:
     """
 
     def __init__(self, config: UsbConfig, *, backend: Any = None) -> None:
-        self._name = _NAMES[config.device]
+        vendor, product = _IDS[config.device]
+        self._name = f"{_NAMES[config.device]} {vendor:04x}:{product:04x}"
         self._core, self._util = _load_pyusb()
         lamps = relay_lamps(config) if config.device == "relay" else {}
         with self._errors("cannot be opened"):
@@ -142,7 +135,7 @@ class UsbLight:
                 endpoint, bytes([0x01, 0xFF, *_RGB[colour], 0, 0, 0]), TIMEOUT_MS
             )
         relays = {colour: lamp for colour, lamp in lamps.items() if isinstance(lamp, int)}
-        return _Relays(device, relays).show
+        return partial(_show_by_relays, device, relays)
 
     def _out_endpoint(self) -> int:
         interface = self._device.get_active_configuration()[(_INTERFACE, 0)]
@@ -162,51 +155,32 @@ class UsbLight:
             raise FeedbackError(
                 f"{what}: libusb is missing; install the system package libusb-1.0-0"
             ) from error
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: descriptors that cannot be read
             remedy = ""
-            if error.errno == errno.EACCES:
+            if getattr(error, "errno", None) == errno.EACCES:
                 remedy = "; install deploy/99-bikeped.rules, and is this user in group plugdev?"
             raise FeedbackError(f"{what}: {error}{remedy}") from error
-        except ValueError as error:
-            # pyusb's answer to descriptors that it cannot read.
-            raise FeedbackError(f"{what}: {error}") from error
 
 
-class _Relays:
-    """HID relay board: one relay a colour, read back after every change.
+def _show_by_relays(device: Any, relays: dict[Colour, int], colour: Colour) -> None:
+    """Closes the relay of `colour`, opens the other wired ones, and reads the board back.
 
-    Only relays that must change are switched, for mechanical ones wear, and only those that are
-    wired to a colour.
+    Only relays that must change are switched, for mechanical ones wear.
     """
-
-    _ON, _OFF = 0xFF, 0xFD
-
-    def __init__(self, device: Any, relays: dict[Colour, int]) -> None:
-        self._device = device
-        self._relays = relays
-
-    def show(self, colour: Colour) -> None:
-        lamp = self._relays.get(colour)
-        state = self._state()
-        # The dark ones first, so two lamps never show at once.
-        for relay in sorted(set(self._relays.values()) - {lamp}):
-            if state & _bit(relay):
-                self._switch(relay, self._OFF)
-        if lamp is not None and not state & _bit(lamp):
-            self._switch(lamp, self._ON)
-        wanted = _bit(lamp) if lamp is not None else 0
-        ours = sum(_bit(relay) for relay in set(self._relays.values()))
-        if (got := self._state() & ours) != wanted:
-            raise FeedbackError(
-                f"{SECTION}: the relay board does not obey: relays {wanted:08b} were asked for, "
-                f"{got:08b} are on; does the board have as many relays as relay_* names?"
-            )
-
-    def _state(self) -> int:
-        return int(_get_feature(self._device, 0, 8)[7])
-
-    def _switch(self, relay: int, command: int) -> None:
-        _set_feature(self._device, 0, bytes([command, relay, 0, 0, 0, 0, 0, 0]))
+    lamp, wired = relays.get(colour), sorted(set(relays.values()))
+    state = int(_get_feature(device, 0, 8)[7])
+    # The dark ones first, so two lamps never show at once.
+    for relay in sorted(wired, key=lambda relay: relay == lamp):
+        if bool(state & _bit(relay)) != (relay == lamp):
+            command = 0xFF if relay == lamp else 0xFD
+            _set_feature(device, 0, bytes([command, relay, 0, 0, 0, 0, 0, 0]))
+    wanted = 0 if lamp is None else _bit(lamp)
+    got = int(_get_feature(device, 0, 8)[7]) & sum(map(_bit, wired))
+    if got != wanted:
+        raise FeedbackError(
+            f"{SECTION}: the relay board does not obey: relays {wanted:08b} were asked for, "
+            f"{got:08b} are on; does the board have as many relays as relay_* names?"
+        )
 
 
 def _bit(relay: int) -> int:

@@ -62,7 +62,7 @@ class Loop:
         self.monitor = FaultMonitor(feed, limits, fault_sources)
         self.counts = FrameCounts()
         self._limited_log = RateLimitedLogger(log)
-        self.stopping = asyncio.Event()
+        self.stopping = asyncio.Event()  #: ends `run`
         self._first_s: float | None = None  # capture time of the first result
         self._newest_s: float | None = None  # capture time of the newest result
 

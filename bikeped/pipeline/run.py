@@ -25,7 +25,6 @@ from bikeped.pipeline.application import Application, Pages, load_detector_pool,
 from bikeped.pipeline.detection_scheduler import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed
-from bikeped.pipeline.loop import Loop
 from bikeped.pipeline.runtime import Notifier, WorkerThread
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
@@ -109,7 +108,7 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
         )
         grabber.start()
         await application.serve_pages()
-        stopping = asyncio.create_task(_stop_when(stop, application.loop))
+        application.loop.stopping = stop  # which may be set already
         notifier.ready(f"watching {config.camera.source}")
         try:
             await application.run()
@@ -117,8 +116,8 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
             log.critical("%s; ending so that a fresh process can start", hang)
             return hang.fault.kind.exit_status or 0
         finally:
+            log.info("stopping")
             notifier.stopping()
-            stopping.cancel()
             # Stopping the rest may take seconds: keeps the light's watchdog from tripping.
             last.callback(asyncio.create_task(_refresh(application.dispatcher)).cancel)
             log.info("latency\n%s", application.telemetry.times.table())
@@ -156,12 +155,6 @@ async def _load_while_alive(
         stopping.cancel()
         loading.cancel()
         await worker.close(0.0)
-
-
-async def _stop_when(stop: asyncio.Event, loop: Loop) -> None:
-    await stop.wait()
-    log.info("stopping")
-    loop.stop()
 
 
 async def _refresh(dispatcher: SignalDispatcher) -> None:
