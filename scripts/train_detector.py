@@ -31,7 +31,7 @@ from bikeped import __version__
 from bikeped.config import LoadedConfig, load_config, road_region
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.detection.model_hash import sha256_of
+from bikeped.detection.base import sha256_of
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.rendering.random_scene import DEFAULT_MIX
 from bikeped.lab.training.augment import AugmentSettings, augment_data

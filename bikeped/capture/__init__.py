@@ -5,14 +5,11 @@
 """
 
 from bikeped.capture.base import FrameSource
+from bikeped.capture.cameras import NetworkSource, V4l2Source
 from bikeped.capture.frame_grabber import FrameGrabber
-from bikeped.capture.images import ImageSource
 from bikeped.capture.jpeg import JpegDecoder, read_size
-from bikeped.capture.network import NetworkSource
-from bikeped.capture.paced import PacedSource
+from bikeped.capture.recordings import ImageSource, PacedSource, VideoSource
 from bikeped.capture.sources import open_source
-from bikeped.capture.v4l2 import V4l2Source
-from bikeped.capture.video import VideoSource
 
 __all__ = [
     "FrameGrabber",

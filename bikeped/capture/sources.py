@@ -6,10 +6,8 @@ import re
 from pathlib import Path
 
 from bikeped.capture.base import FrameSource
-from bikeped.capture.images import IMAGE_SUFFIXES, ImageSource
-from bikeped.capture.network import NetworkSource
-from bikeped.capture.v4l2 import V4l2Source
-from bikeped.capture.video import VideoSource
+from bikeped.capture.cameras import NetworkSource, V4l2Source
+from bikeped.capture.recordings import IMAGE_SUFFIXES, ImageSource, VideoSource
 from bikeped.config import CameraConfig
 from bikeped.errors import CaptureError
 

@@ -1,8 +1,14 @@
 """The three-stage decision. Pure: positions and times in, state and reasons out."""
 
 from bikeped.decision.decider import Decider, explain, pair_metrics, select_pair
-from bikeped.decision.rules import PairChecks, RuleSettings, evaluate_rule
-from bikeped.decision.stages import frame_mask, is_remembered, resolve_state
+from bikeped.decision.rules import (
+    PairChecks,
+    RuleSettings,
+    evaluate_rule,
+    frame_mask,
+    is_remembered,
+    resolve_state,
+)
 from bikeped.decision.track_rows import Pairs, TrackRows, pair_rows
 
 __all__ = [

@@ -6,8 +6,14 @@ import math
 
 import numpy as np
 
-from bikeped.decision.rules import EPSILON_M, PairChecks, RuleSettings, evaluate_rule
-from bikeped.decision.stages import is_remembered, resolve_state
+from bikeped.decision.rules import (
+    EPSILON_M,
+    PairChecks,
+    RuleSettings,
+    evaluate_rule,
+    is_remembered,
+    resolve_state,
+)
 from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
 from bikeped.types import BoolArray, Decision, FloatArray, IntArray, KindArray, PairMetrics, State
 

@@ -1,9 +1,10 @@
-"""The closing checks (definitions, section 8), over any number of pairs at once.
+"""The closing checks (definitions, section 8) of any number of pairs at once, and the three stages.
 
 Each rule compares a pair now with the same pair `lookback_s` ago. Where no frame lies exactly that
 far back, for example because one was dropped, positions are interpolated between the two frames
 around it. A pair younger than the lookback is compared over its life so far; a pair without an
-earlier position is not evaluated.
+earlier position is not evaluated. The stages (paper, algorithm 1): pedestrian present, cyclist
+remembered, approaching.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from bikeped.decision.track_rows import IndexArray, Pairs, TrackRows
-from bikeped.types import BoolArray, FloatArray
+from bikeped.types import BoolArray, FloatArray, State
 
 RuleName = Literal["pairwise", "naive", "ttc", "distance"]
 
@@ -24,6 +26,9 @@ EPSILON_S = 1e-6
 EPSILON_M = 1e-9
 #: Closing speed below which the ttc rule sees no approach, m/s.
 TTC_CLOSING_MIN_MPS = 0.1
+_IDLE, _SAFE, _WARNING, _ALERT = (int(s) for s in State)
+#: State by 4 * pedestrian present + 2 * cyclist remembered + approaching.
+_STATES = np.asarray([_IDLE, _IDLE, _IDLE, _IDLE, _SAFE, _SAFE, _WARNING, _ALERT], np.int8)
 
 
 @dataclass(frozen=True)
@@ -202,3 +207,24 @@ def _walk_back(
         if not np.count_nonzero(go):
             return old, new
         old, new = np.where(go, previous, old), np.where(go, old, new)
+
+
+def resolve_state(
+    pedestrian_present: BoolArray, cyclist_remembered: BoolArray, approaching: BoolArray
+) -> npt.NDArray[np.int8]:
+    """State codes [n]: IDLE without a pedestrian, SAFE without a remembered cyclist, else ALERT or
+    WARNING by the closing check."""
+    stage = pedestrian_present * np.int8(4) + cyclist_remembered * np.int8(2) + approaching
+    return np.asarray(_STATES[stage])
+
+
+def is_remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:
+    """[n]: whether a cyclist was tracked within the last `memory_s`; 0 s means in this frame."""
+    return np.asarray(now_s - last_cyclist_s <= memory_s + EPSILON_S)
+
+
+def frame_mask(frame: IndexArray, frames: int) -> BoolArray:
+    """[frames]: true at the indices in `frame`."""
+    out = np.zeros(frames, np.bool_)
+    out[frame] = True
+    return out

@@ -1,11 +1,18 @@
-"""The detector interface."""
+"""The detector interface, and loading the detector that the configuration describes."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
-from bikeped.types import Detections, ImageArray
+from bikeped.config.schema import DetectionConfig
+from bikeped.errors import DetectorError
+from bikeped.models import model_file
+from bikeped.types import Detections, ImageArray, Region
+
+_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -57,3 +64,61 @@ class Detector(Protocol):
         of another aspect ratio than the frame's.
         """
         ...
+
+
+def sha256_of(path: Path) -> str:
+    """The file's SHA-256 in lower-case hexadecimal, read in chunks of 1 MiB.
+
+    Raises `DetectorError` where the file cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while chunk := file.read(_CHUNK):
+                digest.update(chunk)
+    except FileNotFoundError:
+        raise DetectorError(
+            f"{path}: no such model file; correct detection.model or put the file there"
+        ) from None
+    except OSError as error:
+        raise DetectorError(f"{path}: cannot read the model file: {error.strerror}") from error
+    return digest.hexdigest()
+
+
+def verify_sha256(path: Path, expected: str | None) -> str:
+    """The file's hash; raises `DetectorError` where `detection.sha256` expects another."""
+    actual = sha256_of(path)
+    if expected is not None and expected.lower() != actual:
+        raise DetectorError(
+            f"{path}: SHA-256 is {actual} but detection.sha256 expects {expected.lower()}; "
+            "put the right model there or correct detection.sha256"
+        )
+    return actual
+
+
+def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None = None) -> Detector:
+    """The detector of the section `detection`, warmed up.
+
+    A relative `detection.model` starts from `base_dir`; `bundled` is the model that comes with
+    bikeped, with 8-bit weights on a CPU. `road` is the part of the frames in which road users can
+    appear, for `detection.region`; None: the whole frame. Raises `DetectorError` where there is no
+    model, its hash differs, it cannot be run, or its output layout is unknown.
+    """
+    if config.model is None:
+        raise DetectorError(
+            "detection.model: no model is configured; name an .onnx or .engine file, or bundled"
+        )
+    path = model_file(config.model, base_dir)
+    # Imported where needed: an .engine does not need onnxruntime, nor an .onnx file tensorrt.
+    if path.suffix.lower() == ".onnx":
+        from bikeped.detection.onnx_runtime import OnnxDetector, runs_on_cpu
+
+        path = model_file(config.model, base_dir, on_cpu=runs_on_cpu(config.providers))
+        return OnnxDetector(path, config, verify_sha256(path, config.sha256), road)
+    if path.suffix.lower() == ".engine":
+        from bikeped.detection.trt_engine import EngineDetector
+
+        return EngineDetector(path, config, verify_sha256(path, config.sha256), road=road)
+    raise DetectorError(
+        f"detection.model: {path} is neither .onnx nor .engine; export the model to one of them"
+    )

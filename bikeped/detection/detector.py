@@ -17,18 +17,17 @@ import numpy.typing as npt
 
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection.base import DetectionResult
-from bikeped.detection.classes import (
+from bikeped.detection.model_metadata import (
     UNMAPPED,
+    ModelMetadata,
     class_names,
     cyclist_classes_include_riders,
     kind_table,
 )
-from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.detection.nms import non_max_suppression, vote_boxes
 from bikeped.detection.output_layouts import Candidates, Layout, choose_layout, decode, pick_output
-from bikeped.detection.partial_persons import suppress_partial_person_boxes
+from bikeped.detection.person_boxes import join_riders, suppress_partial_person_boxes
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
-from bikeped.detection.riders import join_riders
 from bikeped.errors import DetectorError
 from bikeped.types import (
     BoolArray,

@@ -16,7 +16,7 @@ from prometheus_client import CollectorRegistry
 from bikeped import __version__
 from bikeped.config import LoadedConfig, road_region
 from bikeped.cores import cores
-from bikeped.detection.load import load_detector
+from bikeped.detection.base import load_detector
 from bikeped.errors import DetectorError
 from bikeped.feedback.light import LightDriver
 from bikeped.feedback.signal_logic import SignalLogic

@@ -1,4 +1,4 @@
-"""The device's tracker: a batch of one scene, with position history and windowed velocity."""
+"""The device's tracker (a batch of one scene, with history and windowed velocity) and predictor."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
+import numpy.typing as npt
 
 from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 from bikeped.types import FloatArray, GroundPoints, Tracks
@@ -79,3 +80,26 @@ class Tracker:
             path.append((time_s, x, y))
             self._paths[key] = path
         return np.asarray(velocity, np.float64).reshape(-1, 2)
+
+
+def predict(
+    xy_m: FloatArray,
+    velocity_mps: FloatArray,
+    acceleration_mps2: FloatArray | None,
+    horizon_s: npt.ArrayLike,
+    order: int = 1,
+) -> FloatArray:
+    """Positions [..., 2] after `horizon_s` seconds (a number, or an array that broadcasts).
+
+    `order` 0 leaves them, 1 adds velocity * horizon, 2 also acceleration * horizon^2 / 2. The paper
+    finds second order worse: the quadratic term amplifies the noise of the acceleration.
+    """
+    if order not in (0, 1, 2):
+        raise ValueError(f"order: expected 0, 1 or 2, got {order}")
+    if order == 0:
+        return xy_m
+    horizon = np.asarray(horizon_s, dtype=np.float64)
+    predicted = xy_m + velocity_mps * horizon
+    if order == 2 and acceleration_mps2 is not None:
+        predicted = predicted + 0.5 * acceleration_mps2 * horizon * horizon
+    return np.asarray(predicted)

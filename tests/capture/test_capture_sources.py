@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bikeped.capture import ImageSource, JpegDecoder, NetworkSource, open_source
-from bikeped.capture.network import without_password
+from bikeped.capture.cameras import without_password
 from bikeped.config import CameraConfig
 from bikeped.errors import CaptureError
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bikeped.capture import V4l2Source, read_size
-from bikeped.capture.v4l2 import MAX_REPEATING_S, trim
+from bikeped.capture.cameras import MAX_REPEATING_S, trim
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT = 96, 64

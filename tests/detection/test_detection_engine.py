@@ -21,8 +21,7 @@ from hypothesis import strategies as st
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection import trt_engine as engine_module
-from bikeped.detection.cuda import Cuda
-from bikeped.detection.trt_engine import EngineDetector, split_header
+from bikeped.detection.trt_engine import Cuda, EngineDetector, split_header
 from bikeped.errors import DetectorError
 from bikeped.types import Kind
 

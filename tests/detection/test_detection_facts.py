@@ -10,9 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.classes import COCO_NAMES, class_names, kind_table
-from bikeped.detection.model_hash import sha256_of, verify_sha256
-from bikeped.detection.model_metadata import ModelMetadata, parse_metadata, resolve_input
+from bikeped.detection.base import sha256_of, verify_sha256
+from bikeped.detection.model_metadata import (
+    COCO_NAMES,
+    ModelMetadata,
+    class_names,
+    kind_table,
+    parse_metadata,
+    resolve_input,
+)
 from bikeped.errors import DetectorError
 from bikeped.types import Kind
 

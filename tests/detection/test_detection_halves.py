@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bikeped.detection.partial_persons import suppress_partial_person_boxes
+from bikeped.detection.person_boxes import suppress_partial_person_boxes
 from bikeped.types import Detections, Kind
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.detection.riders import join_riders
+from bikeped.detection.person_boxes import join_riders
 from bikeped.types import Detections, Kind
 
 P, C, V = Kind.PEDESTRIAN, Kind.CYCLIST, Kind.VEHICLE

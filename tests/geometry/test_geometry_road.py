@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from bikeped.config import load_config, road_region
 from bikeped.geometry import Framing, GroundCamera, Lens
 from bikeped.geometry import road_region as region_of
-from bikeped.geometry.road import MAX_HEIGHT_M
+from bikeped.geometry.framing import MAX_HEIGHT_M
 from bikeped.types import Region
 
 FRAME = Framing(960, 540)

@@ -12,7 +12,7 @@ from bikeped.cli.main import main
 from bikeped.config import load_config, road_region
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.detection.model_hash import sha256_of
+from bikeped.detection.base import sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.lab.training.model_card_text import meets_target, render_card

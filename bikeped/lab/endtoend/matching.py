@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.geometry.boxes import Boxes, iou_matrix
+from bikeped.detection.nms import Boxes, iou_matrix
 from bikeped.lab.rendering import DrawnObject
 from bikeped.types import Detections, IntArray
 

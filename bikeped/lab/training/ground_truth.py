@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.classes import WITH_RIDER
-from bikeped.detection.riders import join_riders
+from bikeped.detection.model_metadata import WITH_RIDER
+from bikeped.detection.person_boxes import join_riders
 from bikeped.lab.training.coco import CocoData, CocoImage, CocoObject
 from bikeped.lab.training.measures import GroundTruth
 from bikeped.types import Detections, FloatArray, Kind

@@ -1,8 +1,18 @@
-"""A folder of images, or one image, as a recording."""
+"""Recordings: image folders, videos, and either played in real time.
+
+Motion JPEG (AVI, MKV, MOV, MP4) is passed on packet by packet, so that a frame is decoded once, at
+the scale that the detector needs. Other codecs are decoded by FFmpeg, in software. Two runs over
+one file give the same bytes and times.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import logging
+import math
 import re
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -10,12 +20,15 @@ import numpy as np
 
 from bikeped.capture.base import FrameSource
 from bikeped.capture.jpeg import read_size
-from bikeped.capture.opencv import as_rgb, silence_opencv, usable_fps
+from bikeped.capture.opencv import FfmpegReader, OpenCapture, as_rgb, silence_opencv, usable_fps
 from bikeped.errors import CaptureError
 from bikeped.types import Frame, ImageArray
 
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 IMAGE_SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp"}
+_log = logging.getLogger(__name__)
+# A container's frame count may be an estimate; a file with less than this share is truncated.
+COMPLETE_SHARE = 0.95
 
 
 class ImageSource(FrameSource):
@@ -109,3 +122,93 @@ def _size(jpeg: bytes | None, rgb: ImageArray | None, path: Path) -> tuple[int, 
         return read_size(jpeg or b"")
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}; remove it") from error
+
+
+class VideoSource(FrameSource):
+    """A video file. `captured_s` is media time in seconds, strictly increasing.
+
+    It is the container's time stamp where that increases, else the previous frame's plus one frame
+    period. Raises CaptureError for a missing, broken or empty file and for one
+    without a frame rate.
+    """
+
+    live = False
+
+    def __init__(self, path: Path | str, *, open_capture: OpenCapture = cv2.VideoCapture) -> None:
+        self.name = str(path)
+        remedy = (
+            "is it a complete video file? `ffprobe` says what is in it, and "
+            "`ffmpeg -i IN -c copy OUT.mkv` repairs some"
+        )
+        if not Path(path).is_file():
+            raise CaptureError(f"{self.name}: no such file; set camera.source to a video")
+        self._reader = FfmpegReader(self.name, self.name, remedy=remedy, open_capture=open_capture)
+        self.width, self.height = self._reader.width, self._reader.height
+        self.fps = self._reader.fps
+        self._number = 0
+        self._last_s = -math.inf
+        if not usable_fps(self.fps):
+            self._reader.close()
+            raise CaptureError(
+                f"{self.name}: has no frame rate (it says {self.fps:g}); "
+                "`ffmpeg -r 30 -i IN -c copy OUT.mkv` writes one"
+            )
+
+    def read(self) -> Frame | None:
+        image = self._reader.read()
+        if image is None:
+            self._report_end()
+            return None
+        captured_s = image.media_s
+        if not (math.isfinite(captured_s) and captured_s > self._last_s):
+            captured_s = self._last_s + 1.0 / self.fps if self._number else 0.0
+        frame = Frame(self._number, captured_s, self.width, self.height, image.jpeg, image.rgb)
+        self._number += 1
+        self._last_s = captured_s
+        return frame
+
+    def close(self) -> None:
+        self._reader.close()
+
+    def _report_end(self) -> None:
+        expected = self._reader.expected_frames
+        if self._number < COMPLETE_SHARE * expected:
+            text = "%s: ends after %d of %.0f frames; is the file truncated?"
+            _log.warning(text, self.name, self._number, expected)
+
+
+class PacedSource(FrameSource):
+    """Returns each frame of `source` at its media time, the first one immediately.
+
+    `captured_s` is rebased on `clock` (monotonic seconds), spaced as in the recording. No frame is
+    dropped here: where reading is slower than the recording, frames come late.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        source: FrameSource,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._source, self._clock, self._sleep = source, clock, sleep
+        self._offset_s: float | None = None
+        self.name = source.name
+        self.width, self.height, self.fps = source.width, source.height, source.fps
+
+    def read(self) -> Frame | None:
+        frame = self._source.read()
+        if frame is None:
+            return None
+        now_s = self._clock()
+        if self._offset_s is None:
+            self._offset_s = now_s - frame.captured_s
+        due_s = frame.captured_s + self._offset_s
+        if due_s > now_s:
+            self._sleep(due_s - now_s)
+        return dataclasses.replace(frame, captured_s=due_s)
+
+    def close(self) -> None:
+        self._source.close()

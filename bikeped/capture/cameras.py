@@ -1,10 +1,13 @@
-"""A camera at /dev/videoN, through OpenCV's V4L2 backend.
+"""Live cameras: at /dev/videoN through OpenCV's V4L2 backend, or on the network.
 
-With CAP_PROP_CONVERT_RGB off OpenCV returns the camera's Motion JPEG undecoded, and
+With CAP_PROP_CONVERT_RGB off OpenCV returns a V4L2 camera's Motion JPEG undecoded, and
 CAP_PROP_POS_MSEC is the kernel's time stamp of the buffer. Not run on a real camera yet: written
-from OpenCV's documentation and tested against a fake at cv2.VideoCapture.
+from OpenCV's documentation and tested against a fake at cv2.VideoCapture. A read that the driver
+never answers cannot be ended from here; see `FrameGrabber.hung_s`.
 
-A read that the driver never answers cannot be ended from here; see `FrameGrabber.hung_s`.
+OpenCV gives no capture time for a network stream (RTSP, or Motion JPEG and others over HTTP), so
+its `captured_s` is the arrival time, after encoding and network: set the known part of that delay
+as `latency.camera_offset_s`.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import urlsplit, urlunsplit
 
 import cv2
 import numpy as np
@@ -23,6 +27,7 @@ from bikeped.capture.base import FrameSource
 from bikeped.capture.jpeg import EOI, read_size
 from bikeped.capture.opencv import (
     Capture,
+    FfmpegReader,
     OpenCapture,
     as_rgb,
     fourcc_text,
@@ -40,6 +45,8 @@ MAX_STAMP_AGE_S = 2.0
 # OpenCV repeats its last buffer, without waiting, after some unplugs.
 MAX_REPEATING_S = 1.0
 REPEAT_PAUSE_S = 0.005
+OPEN_TIMEOUT_MS = 5000
+READ_TIMEOUT_MS = 5000
 
 
 class V4l2Source(FrameSource):
@@ -206,3 +213,61 @@ def _why_not_opened(path: Path) -> str:
     if not os.access(path, os.R_OK | os.W_OK):
         return "no permission; add this user to group video"
     return "cannot be opened; is it a camera, and is another program using it (`fuser -v`)?"
+
+
+class NetworkSource(FrameSource):
+    """A live stream by its address. `fps` is assumed where the stream has no frame rate.
+
+    A stream that ends, fails or sends nothing for 5 s raises CaptureError.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        fps: float,
+        clock: Callable[[], float] = time.monotonic,
+        open_capture: OpenCapture = cv2.VideoCapture,
+    ) -> None:
+        self.name = without_password(address)
+        self._clock = clock
+        self._reader = FfmpegReader(
+            address,
+            self.name,
+            remedy="is the camera on, and are address, user and password right?",
+            params=[
+                int(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC),
+                OPEN_TIMEOUT_MS,
+                int(cv2.CAP_PROP_READ_TIMEOUT_MSEC),
+                READ_TIMEOUT_MS,
+            ],
+            open_capture=open_capture,
+        )
+        self._opened_s: float | None = clock()  # when the first frame, read by now, arrived
+        self.width, self.height = self._reader.width, self._reader.height
+        self.fps = self._reader.fps if usable_fps(self._reader.fps) else fps
+        self._number = 0
+
+    def read(self) -> Frame:
+        image = self._reader.read()
+        if image is None:
+            raise CaptureError(f"{self.name}: the stream ended; is the camera still on?")
+        arrived_s = self._clock() if self._opened_s is None else self._opened_s
+        self._opened_s = None
+        frame = Frame(self._number, arrived_s, self.width, self.height, image.jpeg, image.rgb)
+        self._number += 1
+        return frame
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+def without_password(address: str) -> str:
+    """The address without user, password and query, for logs."""
+    try:
+        parts = urlsplit(address)
+    except ValueError:
+        return address.split("://", 1)[0] + "://..."
+    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
