@@ -2,14 +2,15 @@
 // from the server, in frame pixels. The centre of pixel (u, v) is at the integers.
 
 import { drawLoupe, drawScene } from "/static/align-paint.js";
-import { canvasOf, el, svg } from "/static/ui.js";
+import { keepRows } from "/static/align-panels.js";
+import { $, canvasOf, el, svg } from "/static/ui.js";
 
 const TAP_PX = 8; // a pointer that moves less taps
 
 export class View {
   // `on`: tap(u, v), moved(mark), chosen(mark), removed(mark), entered(mark)
-  constructor({ stage, canvas, pins, loupe }, on) {
-    Object.assign(this, { stage, pins, loupe, on });
+  constructor(on) {
+    Object.assign(this, { stage: $("#stage"), loupe: $("#loupe"), on });
     this.levels = [];
     this.size = null;
     this.grid = null;
@@ -21,7 +22,7 @@ export class View {
     this.left = this.top = 0;
     this.width = this.height = 0;
     this.adding = false;
-    this.paint = canvasOf(canvas, (context, width, height) => {
+    this.paint = canvasOf($("#picture"), (context, width, height) => {
       const before = [this.width, this.height];
       [this.width, this.height] = [width, height];
       if (this.size && (before[0] !== width || before[1] !== height)) this.resized(before);
@@ -157,18 +158,11 @@ export class View {
 
   setMarks(marks) {
     this.marks = marks;
-    for (const [id, element] of this.elements) {
-      if (!marks.some((mark) => mark.id === id)) {
-        element.remove();
-        this.elements.delete(id);
-      }
-    }
+    keepRows(this.elements, marks, (mark) => {
+      const pin = el("button", { type: "button", class: "pin", "data-id": mark.id }, pinShape(), el("span", { class: "tag" }));
+      return $("#pins").appendChild(pin);
+    });
     for (const mark of marks) {
-      if (!this.elements.has(mark.id)) {
-        const pin = el("button", { type: "button", class: "pin", "data-id": mark.id }, pinShape(), el("span", { class: "tag" }));
-        this.elements.set(mark.id, pin);
-        this.pins.append(pin);
-      }
       const pin = this.elements.get(mark.id);
       pin.setAttribute("aria-label", `Mark ${mark.name}${mark.says ? `, ${mark.says}` : ""}`);
       pin.setAttribute("aria-pressed", String(Boolean(mark.chosen)));
@@ -321,8 +315,6 @@ export class View {
 }
 
 function pinShape() {
-  const cross = "M22 4v13M22 27v13M4 22h13M27 22h13";
-  return svg("svg", { viewBox: "0 0 44 44", "aria-hidden": "true" },
-    svg("path", { d: cross, class: "case" }), svg("circle", { cx: 22, cy: 22, r: 11, class: "case" }),
-    svg("path", { d: cross, class: "hair" }), svg("circle", { cx: 22, cy: 22, r: 11, class: "hair" }));
+  const shape = "M22 4v13M22 27v13M4 22h13M27 22h13M33 22a11 11 0 1 0-22 0a11 11 0 1 0 22 0";
+  return svg("svg", { viewBox: "0 0 44 44", "aria-hidden": "true" }, svg("path", { d: shape, class: "case" }), svg("path", { d: shape, class: "hair" }));
 }

@@ -1,11 +1,8 @@
 // The align page: camera values, marks, fit, save. The server computes everything on the ground.
 
-import { Dials } from "/static/align-dials.js";
-import { fitAnswer } from "/static/align-fit.js";
-import { MarkList } from "/static/align-marks.js";
 import { KINDS } from "/static/align-paint.js";
+import { Dials, MarkList, NAMES, fitAnswer, rounded, sign } from "/static/align-panels.js";
 import { View } from "/static/align-view.js";
-import { NAMES, rounded, sign } from "/static/align-words.js";
 import { $, announce, download, el, metres, request, setText, toast } from "/static/ui.js";
 
 let state = null; // the answer of /align/state
@@ -15,34 +12,22 @@ let between = [];
 let chosen = null;
 const free = new Set(["height_m", "pitch_deg"]);
 
-const dials = new Dials(() => changed());
-const view = new View(
-  { stage: $("#stage"), canvas: $("#picture"), pins: $("#pins"), loupe: $("#loupe") },
-  {
-    tap: (u, v) => addMark(u, v),
-    moved: () => marksMoved(),
-    chosen: (mark) => choose(mark),
-    removed: (mark) => removeMark(mark),
-    entered: (mark) => list.focus(mark),
-  },
-);
-const list = new MarkList({
-  changed: () => marksMoved(),
-  chosen: (mark, show) => {
-    choose(mark);
-    if (show) {
-      view.reveal(mark);
-      view.focus(mark);
-    }
-  },
-  removed: (mark) => removeMark(mark),
-  betweenChanged: () => remember(),
-});
-
-function changed() {
+const dials = new Dials(() => {
   showChanges();
   redraw();
-}
+});
+const view = new View({
+  tap: addMark, moved: marksMoved, chosen: choose, removed: removeMark, entered: (mark) => list.focus(mark),
+});
+const list = new MarkList({
+  changed: marksMoved, removed: removeMark, betweenChanged: remember,
+  chosen(mark, show) {
+    choose(mark);
+    if (!show) return;
+    view.reveal(mark);
+    view.focus(mark);
+  },
+});
 
 // --- the grid: one request at a time; changes during a request cause one more with the newest values
 
@@ -313,41 +298,44 @@ async function importMarks(file) {
 }
 
 function listen() {
-  $("#add").addEventListener("click", () => adding(!view.adding));
-  $("#here").addEventListener("click", () => addMark(...view.middle()));
-  $("#in").addEventListener("click", () => view.zoom(1.5));
-  $("#out").addEventListener("click", () => view.zoom(1 / 1.5));
-  $("#all").addEventListener("click", () => view.show(view.contain()));
-  $("#renew").addEventListener("click", newPicture);
   const steps = (big) => {
     dials.setCoarse(big);
     $("#fine").setAttribute("aria-pressed", String(!big));
     $("#coarse").setAttribute("aria-pressed", String(big));
   };
-  $("#fine").addEventListener("click", () => steps(false));
-  $("#coarse").addEventListener("click", () => steps(true));
-  $("#back").addEventListener("click", () => dials.setAll(state.filed));
-  $("#fit").addEventListener("click", fit);
-  $("#undo").addEventListener("click", () => {
-    if (before) dials.setAll(before);
-    $("#undo").hidden = true;
-    $("#fit-answer").replaceChildren();
-    $("#fit").focus();
-  });
-  $("#save").addEventListener("click", save);
-  $("#export").addEventListener("click", () => download(`${JSON.stringify(points(), null, 2)}\n`, "points.json", "application/json"));
-  $("#import").addEventListener("click", () => $("#import-file").click());
+  const clicks = {
+    add: () => adding(!view.adding),
+    here: () => addMark(...view.middle()),
+    in: () => view.zoom(1.5),
+    out: () => view.zoom(1 / 1.5),
+    all: () => view.show(view.contain()),
+    renew: newPicture,
+    fine: () => steps(false),
+    coarse: () => steps(true),
+    back: () => dials.setAll(state.filed),
+    fit,
+    save,
+    export: () => download(`${JSON.stringify(points(), null, 2)}\n`, "points.json", "application/json"),
+    import: () => $("#import-file").click(),
+    undo() {
+      if (before) dials.setAll(before);
+      $("#undo").hidden = true;
+      $("#fit-answer").replaceChildren();
+      $("#fit").focus();
+    },
+    clear() {
+      replaceMarks([], []);
+      marksMoved();
+    },
+    "add-between"() {
+      between.push({ first: marks[0].id, second: marks[marks.length - 1].id, distance_m: null });
+      list.showBetween(between, marks);
+    },
+  };
+  for (const [id, act] of Object.entries(clicks)) $(`#${id}`).addEventListener("click", () => act());
   $("#import-file").addEventListener("change", (event) => {
     if (event.target.files[0]) importMarks(event.target.files[0]);
     event.target.value = "";
-  });
-  $("#clear").addEventListener("click", () => {
-    replaceMarks([], []);
-    marksMoved();
-  });
-  $("#add-between").addEventListener("click", () => {
-    between.push({ first: marks[0].id, second: marks[marks.length - 1].id, distance_m: null });
-    list.showBetween(between, marks);
   });
 }
 
@@ -384,7 +372,6 @@ async function open() {
   makeChoices();
   $("#renew").hidden = !state.live;
   showFile();
-  showChanges();
   listen();
   await newPicture();
   if (view.size) recall();

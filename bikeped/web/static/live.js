@@ -1,13 +1,14 @@
 // The live page. Server-sent events: `hello` once, `now` up to ten times a second, `status` every
 // second, `alerts` and `trend` when they change. Without events the page turns grey and says so.
 
-import { $, STATES, announce, clock, count, duration, el, fixed, metres, millis, seconds, setText, speed, stateIcon } from "/static/ui.js";
+import { $, STATES, announce, canvasOf, clock, colour, count, duration, el, fixed, metres, millis, seconds, setText, speed, stateIcon } from "/static/ui.js";
+import { line } from "/static/canvas.js";
 import { Radar } from "/static/radar.js";
-import { Sparkline } from "/static/sparkline.js";
 
 const CONTACT_S = 2.5;       // contact is lost after this long without an event
 const OLD_S = 2;             // a signal or picture older than this is out of date
 const RETRY_S = 3;
+const TREND_S = 120;         // the lines of the latencies go back so far
 const ANNOUNCE_S = 3;        // shortest time between two announcements to screen readers
 const STAGE_WORDS = {
   acquire: "Capture", pre: "Decode, scale", inference: "Detect", post: "Filter detections",
@@ -15,7 +16,6 @@ const STAGE_WORDS = {
 };
 
 const radar = new Radar($("#radar"));
-const sparks = new Map();
 const trend = [];
 let hello = null;
 let source = null;
@@ -191,19 +191,13 @@ function stopPicture() {
   $("#picture").removeAttribute("src");
 }
 
-$("#picture").addEventListener("load", fitPicture);
+$("#picture").addEventListener("load", ({ target }) => {
+  if (target.naturalWidth > 0) [target.width, target.height] = [target.naturalWidth, target.naturalHeight];
+});
 $("#picture").addEventListener("error", () => {
   broken = true;
   setText($("#picture-note"), "The picture has stopped.");
 });
-
-function fitPicture() {
-  const picture = $("#picture");
-  if (picture.naturalWidth > 0) {
-    picture.width = picture.naturalWidth;
-    picture.height = picture.naturalHeight;
-  }
-}
 
 $("#picture-switch").addEventListener("click", () => {
   paused = !paused;
@@ -336,25 +330,42 @@ function brokerWords(mqtt) {
 // --- latencies
 
 const latencyRows = new Map();
+const trendPaints = [];
 
 function buildLatency(stages) {
   if (latencyRows.size) return;
-  for (const stage of stages) {
+  stages.forEach((stage, i) => {
     const canvas = el("canvas", { "aria-hidden": "true" });
     const row = el("tr", { "data-stage": stage },
       el("th", { scope: "row" }, STAGE_WORDS[stage] ?? stage), el("td", {}, canvas),
       el("td", { class: "number" }, "–"), el("td", { class: "number" }, "–"), el("td", { class: "number" }, "–"));
     $("#latency").append(row);
     latencyRows.set(stage, row);
-    sparks.set(stage, new Sparkline(canvas));
-  }
+    trendPaints.push(canvasOf(canvas, (context, width, height) => drawTrend(context, width, height, i)));
+  });
+}
+
+// Two lines of a stage: the median, and what 95 of 100 frames stay below.
+function drawTrend(context, width, height, stage) {
+  const points = trend.map(({ unix_s, p50, p95 }) => ({ at: unix_s, p50: p50[stage], p95: p95[stage] })).filter(({ p50 }) => p50 !== null);
+  line(context, [[0, height - 0.5], [width, height - 0.5]], { stroke: colour("--line") });
+  if (points.length < 2) return;
+  const end = points[points.length - 1].at;
+  const top = Math.max(...points.map(({ p95 }) => p95), 1e-3) * 1.12;
+  const curve = (key, style) => line(context, points.flatMap((point, i) => {
+    const at = [width - (end - point.at) / TREND_S * width, height - 2 - point[key] / top * (height - 4)];
+    // A pause is a gap, not a slope.
+    return i && point.at - points[i - 1].at > 3 ? [null, at] : [at];
+  }), style);
+  curve("p95", { stroke: colour("--line-strong"), width: 1.5, dash: [2, 2] });
+  curve("p50", { stroke: colour("--accent"), width: 1.8 });
 }
 
 function onTrend(points) {
   const last = trend.length ? trend[trend.length - 1].unix_s : -Infinity;
   trend.push(...points.filter((point) => point.unix_s > last));
   while (trend.length > 120) trend.shift();
-  hello?.stages.forEach((stage, i) => sparks.get(stage).show(trend.map(({ unix_s, p50, p95 }) => [unix_s, p50[i], p95[i]])));
+  trendPaints.forEach((paint) => paint());
 }
 
 connect();
