@@ -48,7 +48,6 @@ _SCRIPTS = (
     "testbench-timeline.js",
     "testbench-plan.js",
     "testbench-flow.js",
-    "testbench-strip.js",
     "testbench-player.js",
     "report.js",
 )

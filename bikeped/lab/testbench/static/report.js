@@ -4,7 +4,7 @@ import { $, canvasOf, el, percent, seconds } from "/static/ui.js";
 import { flow } from "/static/testbench-flow.js";
 import { plan } from "/static/testbench-plan.js";
 import { player } from "/static/testbench-player.js";
-import { drawStrip, stripWords } from "/static/testbench-strip.js";
+import { drawStrip, stripWords } from "/static/testbench-timeline.js";
 
 const data = JSON.parse($("#data").textContent);
 const unrolled = (runs) => runs.flatMap(([code, count]) => Array(count).fill(code));

@@ -94,7 +94,8 @@ function make([key, label, unit, low, high, step, start], about, change) {
   const id = `k${++serial}`;
   const range = about.ranges[key.replace("second_camera", "camera")];
   const help = range?.meaning ?? "";
-  const back = el("button", { type: "button", class: "kn-back", title: `Back to the configuration’s value`, "aria-label": `${label}: back to the configuration’s value`, hidden: true }, "↺");
+  const reset = () => { change(key, get(about.base, key) ?? null); document.getElementById(id)?.focus(); };
+  const back = el("button", { type: "button", class: "kn-back", title: "Back to the configuration’s value", "aria-label": `${label}: back to the configuration’s value`, hidden: true, onclick: reset }, "↺");
   const name = el("label", { for: id, title: help }, label);
   const finish = (node, read) => ({
     node,
@@ -107,42 +108,36 @@ function make([key, label, unit, low, high, step, start], about, change) {
       return changed;
     },
   });
-  back.addEventListener("click", () => { change(key, get(about.base, key) ?? null); document.getElementById(id)?.focus(); });
 
   if (unit === "choice") {
     const options = CHOICES[key];
-    const select = el("select", { id }, options.map(([value, text], i) => el("option", { value: i }, text)));
-    select.addEventListener("change", () => change(key, options[select.selectedIndex][0]));
+    const onchange = () => change(key, options[select.selectedIndex][0]);
+    const select = el("select", { id, onchange }, options.map(([, text], i) => el("option", { value: i }, text)));
     return finish(el("div", { class: "kn kn-choice" }, name, back, select), (value) => { select.selectedIndex = options.findIndex(([v]) => v === (value ?? null)); });
   }
   if (unit === "switch" || unit === "second") {
-    const box = el("input", { type: "checkbox", id });
-    box.addEventListener("change", () => change(key, unit === "second" ? (box.checked ? OPPOSITE : null) : box.checked));
+    const onchange = () => change(key, unit === "second" ? (box.checked ? OPPOSITE : null) : box.checked);
+    const box = el("input", { type: "checkbox", id, onchange });
     return finish(el("div", { class: "kn kn-switch" }, box, name, back), (value) => { box.checked = Boolean(value); });
   }
 
-  const number = el("input", { type: "number", id, step: "any", min: range?.low ?? undefined, max: range?.high ?? undefined, "aria-describedby": help ? `${id}-help` : undefined });
-  const whole = range?.whole;
-  const take = (text) => {
-    const value = Number(text);
-    if (text === "" || !Number.isFinite(value) || !number.checkValidity()) return;
-    change(key, whole ? Math.round(value) : value);
+  const take = () => {
+    const value = Number(number.value);
+    if (number.value !== "" && Number.isFinite(value) && number.checkValidity()) change(key, range?.whole ? Math.round(value) : value);
   };
-  number.addEventListener("input", () => take(number.value));
+  const number = el("input", { type: "number", id, step: "any", min: range?.low, max: range?.high, "aria-describedby": help ? `${id}-help` : null, oninput: take });
   const parts = [name, back, number, el("span", { class: "kn-unit" }, unit === "number" ? "" : unit)];
   let slider = null;
   if (unit !== "number") {
-    slider = el("input", { type: "range", min: low, max: high, step, "aria-label": `${label}${unit ? `, ${unit}` : ""}`, "data-key": key });
-    slider.addEventListener("input", () => { number.value = slider.value; take(slider.value); });
+    const oninput = () => { number.value = slider.value; take(); };
+    slider = el("input", { type: "range", min: low, max: high, step, "aria-label": `${label}${unit ? `, ${unit}` : ""}`, "data-key": key, oninput });
     parts.push(slider);
   }
   if (help) parts.push(el("span", { id: `${id}-help`, class: "unseen" }, help));
   const node = el("div", { class: "kn" });
-  const optional = start !== undefined;
   let box = null;
-  if (optional) { // a number that may be absent: a switch beside it
-    box = el("input", { type: "checkbox", "aria-label": `${label}: set it` });
-    box.addEventListener("change", () => change(key, box.checked ? start : null));
+  if (start !== undefined) { // a number that may be absent: a switch beside it
+    box = el("input", { type: "checkbox", "aria-label": `${label}: set it`, onchange: () => change(key, box.checked ? start : null) });
     parts.unshift(box);
     node.classList.add("kn-optional");
   }

@@ -17,6 +17,7 @@ export function editor(host, change, actions) {
 
   // The page may rename the changed scenario.
   const emit = () => { script.name = change(structuredClone(script)); };
+  const edited = () => { sync(); emit(); };
   const handles = () => (script?.agents ?? []).flatMap((agent, a) => agent.path.map(([t, x, y], i) => (
     { a, i, t, x, y, role: ROLE[agent.kind] ?? "vehicle", chosen: chosen[0] === a && chosen[1] === i })));
 
@@ -32,8 +33,7 @@ export function editor(host, change, actions) {
     },
     move({ a, i }, x, y) {
       place(script.agents[a].path, i, round(x, 2), round(y, 2), keepSpeed);
-      sync();
-      emit();
+      edited();
     },
     drop() { announce("Path changed."); },
     add(x, y) {
@@ -42,8 +42,7 @@ export function editor(host, change, actions) {
       const pace = speedOf(path, path.length - 1) || 1.4;
       path.push([round(t + Math.max(Math.hypot(x - px, y - py) / pace, LEAST_STEP_S), 2), round(x, 2), round(y, 2)]);
       chosen = [chosen[0], path.length - 1];
-      sync();
-      emit();
+      edited();
     },
   };
 
@@ -60,29 +59,25 @@ export function editor(host, change, actions) {
 
   function build() {
     rows.length = 0;
-    const name = el("input", { type: "text", value: script.name, maxlength: 120, "aria-label": "Name of the scenario" });
-    name.addEventListener("change", () => { if (name.value.trim()) { script.name = name.value.trim(); emit(); } });
-    nameField = name;
+    const rename = () => { if (nameField.value.trim()) { script.name = nameField.value.trim(); emit(); } };
+    nameField = el("input", { type: "text", value: script.name, maxlength: 120, "aria-label": "Name of the scenario", onchange: rename });
     const pick = (label, values, key) => {
-      const select = el("select", { "aria-label": label }, values.map((value) => el("option", { value, selected: script[key] === value }, value)));
-      select.addEventListener("change", () => { script[key] = select.value; emit(); });
-      return el("label", { class: "tb-pick" }, el("span", {}, label), select);
+      const onchange = (event) => { script[key] = event.target.value; emit(); };
+      return el("label", { class: "tb-pick" }, el("span", {}, label),
+        el("select", { "aria-label": label, onchange }, values.map((value) => el("option", { value, selected: script[key] === value }, value))));
     };
-    const keep = el("input", { type: "checkbox", checked: keepSpeed, id: "ed-keep" });
-    keep.addEventListener("change", () => { keepSpeed = keep.checked; });
-    const file = el("input", { type: "file", class: "unseen", accept: ".yaml,.yml,text/yaml", id: "ed-open" });
-    file.addEventListener("change", () => { if (file.files[0]) actions.load(file.files[0]); file.value = ""; });
+    const keep = el("input", { type: "checkbox", checked: keepSpeed, id: "ed-keep", onchange: () => { keepSpeed = keep.checked; } });
+    const open = () => { if (file.files[0]) actions.load(file.files[0]); file.value = ""; };
+    const file = el("input", { type: "file", class: "unseen", accept: ".yaml,.yml,text/yaml", id: "ed-open", onchange: open });
     host.replaceChildren(
       el("p", { class: "note" }, "Drag the squares in the plan; a double click adds a waypoint to the road user last touched. Or write the numbers: t in seconds, x east and y north in metres; the speed is that on the way to this waypoint."),
       el("div", { class: "ed-top" },
-        el("label", { class: "tb-pick ed-name" }, el("span", {}, "Name"), name),
+        el("label", { class: "tb-pick ed-name" }, el("span", {}, "Name"), nameField),
         pick("Hazard", HAZARDS, "hazard"), pick("Vehicle", ["bicycle", "ebike"], "vehicle"), pick("Expected", ["idle", "safe", "warning", "alert"], "expected"),
         el("label", { class: "row ed-keep" }, keep, "moving keeps speeds (else times)")),
       el("div", { class: "ed-agents" }, script.agents.map(agentTable)),
       el("div", { class: "row" },
-        el("button", { type: "button", class: "small", onclick: () => addAgent("pedestrian") }, "Add a pedestrian"),
-        el("button", { type: "button", class: "small", onclick: () => addAgent("cyclist") }, "Add a cyclist"),
-        el("button", { type: "button", class: "small", onclick: () => addAgent("car") }, "Add a car"),
+        ["pedestrian", "cyclist", "car"].map((kind) => el("button", { type: "button", class: "small", onclick: () => addAgent(kind) }, `Add a ${kind}`)),
         el("button", { type: "button", class: "small primary", onclick: actions.save }, "Save as a scenario file"),
         el("label", { class: "button small", for: "ed-open" }, "Open a scenario file", file),
         el("button", { type: "button", class: "small", onclick: actions.original }, "Throw my paths away")),
@@ -91,7 +86,7 @@ export function editor(host, change, actions) {
 
   function agentTable(agent, a) {
     const kind = el("select", { "aria-label": `Kind of road user ${agent.id}` }, KINDS.map((k) => el("option", { value: k, selected: agent.kind === k }, k)));
-    kind.addEventListener("change", () => { agent = script.agents[a]; agent.kind = kind.value; delete agent.size; sync(); emit(); });
+    kind.addEventListener("change", () => { agent = script.agents[a]; agent.kind = kind.value; delete agent.size; edited(); });
     const body = el("tbody", {}, agent.path.map((point, i) => pointRow(agent.id, a, i)));
     return el("fieldset", { class: "ed-agent", "data-role": ROLE[agent.kind] ?? "vehicle" },
       el("legend", {}, `${agent.kind} ${agent.id}`),
@@ -108,8 +103,7 @@ export function editor(host, change, actions) {
         const value = Number(input.value);
         if (input.value === "" || !Number.isFinite(value)) return;
         edit(script.agents[a].path, i, k, value, keepSpeed);
-        sync();
-        emit();
+        edited();
       });
       return input;
     };
@@ -124,22 +118,19 @@ export function editor(host, change, actions) {
     const path = script.agents[a].path, here = path[i], next = path[i + 1];
     const point = next ? here.map((value, k) => round((value + next[k]) / 2, 2)) : [round(here[0] + 1, 2), round(2 * here[1] - path[i - 1][1], 2), round(2 * here[2] - path[i - 1][2], 2)];
     path.splice(i + 1, 0, point);
-    sync();
-    emit();
+    edited();
   }
 
   function removePoint(a, i) {
     script.agents[a].path.splice(i, 1);
     chosen = [a, 0];
-    sync();
-    emit();
+    edited();
   }
 
   function removeAgent(a) {
     script.agents.splice(a, 1);
     chosen = [0, 0];
-    sync();
-    emit();
+    edited();
   }
 
   function addAgent(kind) {
@@ -147,8 +138,7 @@ export function editor(host, change, actions) {
     const path = kind === "pedestrian" ? [[0, 5, -7], [10, 5, 6]] : [[1, -14, round(-2 + id % 4, 1)], [8, 22, round(-2 + id % 4, 1)]];
     script.agents.push({ id, kind, path });
     chosen = [script.agents.length - 1, 0];
-    sync();
-    emit();
+    edited();
   }
 
   return {

@@ -1,7 +1,7 @@
 // The whole suite, before and after: gates, figures, a strip for every scenario, and how to repeat it.
 
 import { canvasOf, el, fixed, percent, seconds } from "/static/ui.js";
-import { drawStrip, stripWords } from "/static/testbench-strip.js";
+import { drawStrip, stripWords } from "/static/testbench-timeline.js";
 
 const FIGURES = [
   ["sensitivity", "Sensitivity", percent, 1], ["specificity", "Specificity", percent, 1],
