@@ -9,13 +9,14 @@ token once, on the login page or in a link `/?token=...`, and keeps a cookie; pr
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import ipaddress
 import socket
 import time
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -146,39 +147,35 @@ def _read_token(path: Path) -> str:
     return token
 
 
+@dataclass
 class FailedLogins:
     """Wrong tokens of the last `window_s` seconds, by client address and in all; bounded."""
 
-    def __init__(
-        self,
-        per_address: int = 6,
-        overall: int = 100,
-        window_s: float = 60.0,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._per_address, self._overall, self._window_s = per_address, overall, window_s
-        self._clock = clock
-        self._by_address: OrderedDict[str, list[float]] = OrderedDict()
+    per_address: int = 6
+    overall: int = 100
+    window_s: float = 60.0
+    clock: Callable[[], float] = time.monotonic
+    _by_address: OrderedDict[str, list[float]] = field(default_factory=OrderedDict)
 
     def count(self, address: str) -> None:
         """One more wrong token from `address`."""
         times = self._recent(self._by_address.pop(address, []))
-        self._by_address[address] = [*times, self._clock()][-self._per_address :]
-        while len(self._by_address) > self._overall:
+        self._by_address[address] = [*times, self.clock()][-self.per_address :]
+        while len(self._by_address) > self.overall:
             self._by_address.popitem(last=False)
 
     def wait_s(self, address: str) -> float:
         """Seconds until a token from `address` is checked again; 0: now."""
         mine = self._recent(self._by_address.get(address, []))
-        if len(mine) >= self._per_address:
-            return mine[0] + self._window_s - self._clock()
+        if len(mine) >= self.per_address:
+            return mine[0] + self.window_s - self.clock()
         everyone = sorted(t for times in self._by_address.values() for t in self._recent(times))
-        if len(everyone) >= self._overall:
-            return everyone[-self._overall] + self._window_s - self._clock()
+        if len(everyone) >= self.overall:
+            return everyone[-self.overall] + self.window_s - self.clock()
         return 0.0
 
     def _recent(self, times: list[float]) -> list[float]:
-        since_s = self._clock() - self._window_s
+        since_s = self.clock() - self.window_s
         return [t for t in times if t > since_s]
 
 
@@ -239,12 +236,7 @@ def _is_same_origin(request: web.Request) -> bool:
     """
     headers = request.headers
     changes = request.method not in _SAFE_METHODS or hdrs.UPGRADE in headers
-    origin = headers.get(hdrs.ORIGIN)
-    if (
-        changes
-        and origin is not None
-        and not _origin_matches_host(origin, headers.get(hdrs.HOST, ""))
-    ):
+    if changes and hdrs.ORIGIN in headers and not _origin_matches_host(headers):
         return False
     site = headers.get("Sec-Fetch-Site")
     if site is None or site == "same-origin":
@@ -255,31 +247,24 @@ def _is_same_origin(request: web.Request) -> bool:
     return site == "none" or (opened and headers.get("Sec-Fetch-Dest") == "document")
 
 
-def _origin_matches_host(origin: str, host: str) -> bool:
-    try:
-        parts = urlsplit(origin)
-    except ValueError:
-        return False
-    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.strip().lower()
+def _origin_matches_host(headers: Mapping[str, str]) -> bool:
+    with contextlib.suppress(ValueError):
+        origin, host = urlsplit(headers[hdrs.ORIGIN]), headers.get(hdrs.HOST, "")
+        return origin.scheme in ("http", "https") and origin.netloc.lower() == host.strip().lower()
+    return False
 
 
 def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(name))
+    return False
 
 
 def _rate_limit_key(address: str) -> str:
     """An IPv4 address, or the /64 of an IPv6 address, which one client may have as a whole."""
-    try:
-        found = ipaddress.ip_address(address.partition("%")[0])
-    except ValueError:
-        return address
-    if found.version == 4:
-        return address
-    return str(ipaddress.ip_network((found, 64), strict=False))
+    with contextlib.suppress(ValueError):
+        return str(ipaddress.IPv6Network((address.partition("%")[0], 64), strict=False))
+    return address
 
 
 def _digest(text: str) -> bytes:

@@ -10,6 +10,7 @@ import signal as signals
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -99,7 +100,7 @@ def make_application(
         add(app)
     paths = [page.path for page in app[_PAGES]]
     if paths and "/" not in paths:
-        app.router.add_get("/", _redirect_to(paths[0]))
+        app.router.add_get("/", partial(_redirect, paths[0]))
     return app
 
 
@@ -130,8 +131,8 @@ def serve_pages(
     Raises ConfigError when others could reach them without a token, BikepedError when the port
     cannot be bound.
     """
-    access = load_access_policy(config, base_dir, source)
-    asyncio.run(_serve(config, make_application(access, *page_adders), announce))
+    app = make_application(load_access_policy(config, base_dir, source), *page_adders)
+    asyncio.run(_serve(config, app, announce))
 
 
 async def _serve(config: WebConfig, app: web.Application, announce: Callable[[str], None]) -> None:
@@ -191,13 +192,11 @@ async def _set_security_headers(_request: web.Request, response: web.StreamRespo
 def _load_static(folder: Path) -> dict[str, _File]:
     """The files of `folder`/static by name: what is not here is not served, whatever the path."""
     files = {}
-    folder = folder / "static"
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.suffix in _TYPES and not path.name.startswith("."):
+    for path in (folder / "static").glob("[!.]*"):
+        if path.suffix in _TYPES:
             data = path.read_bytes()
-            name = path.relative_to(folder).as_posix()
             etag = hashlib.sha256(data).hexdigest()[:20]
-            files[name] = _File(data, _TYPES[path.suffix], etag)
+            files[path.name] = _File(data, _TYPES[path.suffix], etag)
     return files
 
 
@@ -218,26 +217,14 @@ async def _static(request: web.Request) -> web.StreamResponse:
 
 def _page(request: web.Request, page: Page, status: int = 200) -> web.Response:
     """`page` inside the common frame."""
-    text = render(
-        "frame.html",
-        page.folder / "templates",
-        WEB_FOLDER / "templates",
-        pages=request.app[_PAGES],
-        path=page.path,
-        title=page.title,
-        template=page.template,
-        scripts=page.scripts,
-        styles=page.styles,
-        version=__version__,
-    )
+    folders = page.folder / "templates", WEB_FOLDER / "templates"
+    pages = request.app[_PAGES]
+    text = render("frame.html", *folders, pages=pages, version=__version__, **vars(page))
     return web.Response(status=status, text=text, content_type="text/html")
 
 
-def _redirect_to(path: str) -> Handler:
-    async def redirect(_request: web.Request) -> web.StreamResponse:
-        raise web.HTTPFound(path)
-
-    return redirect
+async def _redirect(path: str, _request: web.Request) -> web.StreamResponse:
+    raise web.HTTPFound(path)
 
 
 # --- login
@@ -281,15 +268,9 @@ def _start_session(request: web.Request, path: str) -> web.Response:
     """
     text = render("welcome.html", WEB_FOLDER / "templates", target=_local(path))
     answer = web.Response(text=text, content_type="text/html")
-    answer.set_cookie(
-        COOKIE,
-        request.app[_POLICY].new_cookie(time.time()),
-        max_age=SESSION_S,
-        httponly=True,
-        samesite="Strict",
-        secure=request.secure,
-        path="/",
-    )
+    cookie = request.app[_POLICY].new_cookie(time.time())
+    flags: Any = {"httponly": True, "samesite": "Strict", "secure": request.secure}
+    answer.set_cookie(COOKIE, cookie, max_age=SESSION_S, **flags)
     return answer
 
 
