@@ -13,7 +13,7 @@ from bikeped.config import LoadedConfig, parse_config
 from bikeped.faults import Fault
 from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.detection_scheduler import DecodedFrame
-from bikeped.pipeline.frame_result import FrameResult
+from bikeped.pipeline.loop import FrameResult
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.builders import health_message
 from bikeped.telemetry.mqtt import MqttStatus

@@ -27,6 +27,8 @@ The machine counts good frames: new decisions without a fault, in a row. It star
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from bikeped.config.schema import FeedbackConfig
 from bikeped.faults import Fault
 from bikeped.types import Colour, Signal, Sound, State
@@ -49,28 +51,22 @@ def fault_signal(faults: tuple[Fault, ...], blink_hz: float) -> Signal:
     return Signal("FAULT", Colour.ORANGE, blink_hz, Sound.NONE, faults)
 
 
+@dataclass
 class SignalLogic:
     """Turns decisions and faults into signals; one instance a light.
 
-    `blink_hz` and `fault_blink_hz` in flashes per second, `hold_alert_s` in seconds,
-    `recover_frames` in frames. ValueError for a light that would not blink.
+    ValueError for a light that would not blink.
     """
 
-    def __init__(
-        self,
-        *,
-        blink_hz: float = 2.0,
-        fault_blink_hz: float = 0.5,
-        hold_alert_s: float = 1.0,
-        recover_frames: int = 5,
-    ) -> None:
-        if not blink_hz > 0:
-            raise ValueError(f"ALERT must blink: expected blink_hz > 0, got {blink_hz}")
-        fault_signal((), fault_blink_hz)
-        self._blink_hz = blink_hz
-        self._fault_blink_hz = fault_blink_hz
-        self._hold_alert_s = hold_alert_s
-        self._recover_frames = recover_frames
+    blink_hz: float = 2.0  #: of ALERT, flashes a second
+    fault_blink_hz: float = 0.5  #: of FAULT
+    hold_alert_s: float = 1.0
+    recover_frames: int = 5
+
+    def __post_init__(self) -> None:
+        if not self.blink_hz > 0:
+            raise ValueError(f"ALERT must blink: expected blink_hz > 0, got {self.blink_hz}")
+        fault_signal((), self.fault_blink_hz)
         self._good_frames = 0
         self._recovering_from: tuple[Fault, ...] = (STARTING,)
         self._decided: State | None = None  # by the newest good frame
@@ -105,14 +101,14 @@ class SignalLogic:
             )
         elif decided is not None:
             self._decided = decided
-            self._good_frames = min(self._good_frames + 1, self._recover_frames)
-        trusted = self._decided if self._good_frames >= self._recover_frames else None
+            self._good_frames = min(self._good_frames + 1, self.recover_frames)
+        trusted = self._decided if self._good_frames >= self.recover_frames else None
 
         if self._alert_held(now_s) or trusted is State.ALERT:
             # The faults travel with the red light, so that telemetry sees them.
-            signal = Signal("ALERT", Colour.RED, self._blink_hz, Sound.BELL, faults)
+            signal = Signal("ALERT", Colour.RED, self.blink_hz, Sound.BELL, faults)
         elif trusted is None:
-            signal = fault_signal(faults or self._recovering_from, self._fault_blink_hz)
+            signal = fault_signal(faults or self._recovering_from, self.fault_blink_hz)
         else:
             begins = trusted is State.SAFE and self._shown != "SAFE"
             sound = Sound.CHIME if begins else Sound.NONE
@@ -129,4 +125,4 @@ class SignalLogic:
             return False
         age_s = now_s - self._alert_s
         # The call that brought the ALERT shows it even with hold_alert_s = 0.
-        return age_s == 0 or 0 <= age_s < self._hold_alert_s
+        return age_s == 0 or 0 <= age_s < self.hold_alert_s

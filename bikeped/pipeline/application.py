@@ -29,8 +29,7 @@ from bikeped.pipeline.detection_scheduler import (
 )
 from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, Limits
 from bikeped.pipeline.feed import Feed
-from bikeped.pipeline.frame_result import FrameResultListener
-from bikeped.pipeline.loop import Loop
+from bikeped.pipeline.loop import FrameResultListener, Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher, SignalListener
 from bikeped.pipeline.telemetry import Telemetry, report_health
 from bikeped.pipeline.track_and_decide import TrackAndDecide
@@ -154,7 +153,6 @@ class Application:
             outputs=(self.telemetry, *watchers, *outputs),
             limits=limits,
             on_tick=on_tick,
-            max_inflight=detector.max_inflight if isinstance(detector, DetectorPool) else 1,
             fault_sources=(
                 lambda: None if speaker is None else speaker.fault,
                 lambda: None if audit is None else audit.fault,

@@ -92,6 +92,7 @@ class DetectionStage:
 
     def __init__(self, detector: FrameDetector, view_width: int = 0) -> None:
         self.detect = detector.detect
+        self.max_inflight = detector.max_inflight if isinstance(detector, DetectorPool) else 1
         self._decode_size = detector.decode_size
         self._view_width = view_width
         self._jpeg = JpegDecoder(buffers=FRAME_BUFFERS)

@@ -1,5 +1,6 @@
-"""The loop: wires feed, detection, tracking and decision, the signal and the listeners.
+"""The loop, and the result of a frame that it hands on.
 
+`Loop` wires feed, detection, tracking and decision, the signal and the listeners.
 `DetectionScheduler` decodes and detects in threads. The rest (ground, track, decide, signal,
 queues) happens on the event loop and takes about a millisecond a frame. `run` and `replay` differ
 only in their feed and their clock.
@@ -15,9 +16,14 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
 
 from bikeped.detection.base import DetectionResult
 from bikeped.faults import Fault
+from bikeped.overlay import GroundToFrame, OverlayData, ground_projector
 from bikeped.pipeline.detection_scheduler import (
     DecodedFrame,
     DetectionScheduler,
@@ -26,19 +32,89 @@ from bikeped.pipeline.detection_scheduler import (
 )
 from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, FaultMonitor, Limits, StageHangError
 from bikeped.pipeline.feed import Feed
-from bikeped.pipeline.frame_result import FrameResult, FrameResultListener, stage_latencies
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
-from bikeped.pipeline.track_and_decide import TrackAndDecide
+from bikeped.pipeline.track_and_decide import TrackAndDecide, TrackingResult
+from bikeped.types import Detections, Signal
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """One frame on its whole way; `t_s` is its capture time since the first result."""
+
+    decoded: DecodedFrame
+    t_s: float
+    detections: Detections
+    tracking: TrackingResult
+    signal: Signal
+    latency_ms: dict[str, float]  #: by stage, with `total` and `capture_age`
+
+
+class FrameResultListener(Protocol):
+    """Takes frame results: telemetry, audit log, event file, overlay."""
+
+    async def on_frame_result(self, result: FrameResult) -> None:
+        """One frame's result. On a live feed it is only queued: the loop waits for this."""
+
+
+def stage_latencies(
+    decoded: DecodedFrame,
+    answer: DetectionResult,
+    tracking: TrackingResult,
+    feedback_ms: float,
+    total_ms: float | None,
+) -> dict[str, float]:
+    """Milliseconds by stage: the paper's, `acquire`, their `total`, and `capture_age`.
+
+    `total_ms` is measured from taking the frame over to setting the light; None sums the stages,
+    as for a recording: it is decoded ahead, as no camera could be, and waiting is no latency.
+    """
+    stages = {
+        "pre": decoded.decode_ms + answer.pre_ms,
+        "inference": answer.inference_ms,
+        "post": answer.post_ms,
+        "track": tracking.track_ms,
+        "decide": tracking.decide_ms,
+        "feedback": feedback_ms,
+    }
+    total_ms = sum(stages.values()) if total_ms is None else total_ms
+    return {
+        "acquire": decoded.acquire_ms,
+        **stages,
+        "total": total_ms,
+        "capture_age": total_ms + decoded.acquire_ms,
+    }
+
+
+def frame_overlay(
+    result: FrameResult, track_and_decide: TrackAndDecide, signal: Signal | None = None
+) -> tuple[OverlayData, GroundToFrame]:
+    """The data to draw, and the projection of ground points into the frame.
+
+    `signal` None: shown as the decision's state. Call it on the event loop: the tracker's history
+    changes with the next frame.
+    """
+    frame, tracking = result.decoded.frame, result.tracking
+    data = OverlayData(
+        detections=result.detections,
+        tracks=tracking.tracks,
+        decision=tracking.decision,
+        frame_number=frame.number,
+        time_s=result.t_s,
+        signal=signal,
+        latency_s=result.latency_ms["total"] / 1e3,
+        history={key: np.asarray(xy) for key, xy in track_and_decide.tracker.history().items()},
+    )
+    mapper = track_and_decide.ground_mapper
+    return data, ground_projector(mapper.camera, mapper.framing_for(frame.width, frame.height))
 
 
 class Loop:
     """Moves frames from `feed` to the light. `clock` gives seconds on the frames' time base.
 
-    `max_inflight`: frames that the detector may work on at once. `fault_sources` are asked for
-    faults of other parts (see `FaultMonitor`).
+    `fault_sources` are asked for faults of other parts (see `FaultMonitor`).
     """
 
     def __init__(
@@ -52,13 +128,11 @@ class Loop:
         limits: Limits = DEFAULT_LIMITS,
         clock: Callable[[], float] = time.monotonic,
         on_tick: Callable[[], None] = lambda: None,
-        max_inflight: int = 1,
         fault_sources: Sequence[Callable[[], Fault | None]] = (),
     ) -> None:
         self.feed, self._detection, self._track_and_decide = feed, detection, track_and_decide
         self._dispatcher, self._outputs = dispatcher, tuple(outputs)
         self._limits, self._clock, self._on_tick = limits, clock, on_tick
-        self._max_inflight = max_inflight
         self.monitor = FaultMonitor(feed, limits, fault_sources)
         self.counts = FrameCounts()
         self._limited_log = RateLimitedLogger(log)
@@ -92,7 +166,7 @@ class Loop:
             self._track_and_decide.ground_mapper,
             self._show_without_frame,
             self._process,
-            max_inflight=self._max_inflight,
+            max_inflight=self._detection.max_inflight,
             clock=self._clock,
         )
         detecting = asyncio.create_task(scheduler.detect_frames(), name="detect")

@@ -22,7 +22,7 @@ from bikeped.overlay import VideoWriter, compose
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_scheduler import FrameDetector
 from bikeped.pipeline.feed import RecordedFeed
-from bikeped.pipeline.frame_result import FrameResult, FrameResultListener, frame_overlay
+from bikeped.pipeline.loop import FrameResult, FrameResultListener, frame_overlay
 from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
 from bikeped.telemetry.events import EventWriter

@@ -15,8 +15,7 @@ from bikeped.config import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
 from bikeped.feedback.light import LightDriver
-from bikeped.pipeline.frame_result import FrameResult
-from bikeped.pipeline.loop import Loop
+from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.telemetry.audit import AuditLog
@@ -141,14 +140,9 @@ class Telemetry:
         )
 
     def _counters(self, loop: Loop) -> Counters:
-        counts = loop.counts
         return Counters(
-            received=counts.received,
-            frames=counts.frames,
+            **vars(loop.counts),
             dropped=loop.feed.dropped(),
-            undecodable=counts.undecodable,
-            failed=counts.failed,
-            out_of_order=counts.out_of_order,
             alerts=self._alerts.count,
             mqtt_dropped=self._mqtt.status.dropped if self._mqtt else 0,
             audit_dropped=self._audit.dropped if self._audit else 0,

@@ -19,7 +19,7 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.errors import CaptureError
 from bikeped.overlay import GroundToFrame, OverlayData, draw_overlay, encode_jpeg
-from bikeped.pipeline.frame_result import FrameResult, frame_overlay
+from bikeped.pipeline.loop import FrameResult, frame_overlay
 from bikeped.pipeline.runtime import RateLimitedLogger, WorkerThread
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import ImageArray

@@ -18,7 +18,7 @@ import numpy as np
 
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import fault_texts
-from bikeped.pipeline.frame_result import FrameResult
+from bikeped.pipeline.loop import FrameResult
 from bikeped.telemetry.builders import finite_tracks, track_records
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.schema import EventTrack

@@ -9,7 +9,7 @@ from aiohttp import web
 
 from bikeped.config import LoadedConfig
 from bikeped.pipeline.application import WebContext
-from bikeped.pipeline.frame_result import FrameResult
+from bikeped.pipeline.loop import FrameResult
 from bikeped.telemetry.http_server import add_monitoring
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align

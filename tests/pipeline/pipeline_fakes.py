@@ -14,8 +14,7 @@ from bikeped.faults import Fault, fault_texts
 from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.pipeline.detection_scheduler import DecodedFrame, DetectionStage
 from bikeped.pipeline.fault_monitor import Limits
-from bikeped.pipeline.frame_result import FrameResult
-from bikeped.pipeline.loop import Loop
+from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Decision, Detections, Frame, Kind, Signal
@@ -201,16 +200,17 @@ class Rig:
             self.light,  # type: ignore[arg-type]
             listeners=(self.recorder,),
         )
+        detection = DetectionStage(self.detector)
+        detection.max_inflight = self.max_inflight
         self.loop = Loop(
             feed=self.feed,
-            detection=DetectionStage(self.detector),
+            detection=detection,
             track_and_decide=self.track_and_decide,
             dispatcher=self.dispatcher,
             outputs=self.outputs,  # type: ignore[arg-type]
             limits=self.limits,
             clock=self.clock,
             on_tick=self.recorder.tick,
-            max_inflight=self.max_inflight,
             fault_sources=self.fault_sources,
         )
         self.task = asyncio.create_task(self.loop.run())

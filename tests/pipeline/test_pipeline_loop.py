@@ -14,7 +14,7 @@ from bikeped.detection.base import DetectionResult
 from bikeped.errors import CaptureError, DetectorError, GeometryError
 from bikeped.pipeline.detection_scheduler import DecodedFrame, LatestFrameSlot
 from bikeped.pipeline.fault_monitor import RESTART_AFTER_S, Limits, StageHangError
-from bikeped.pipeline.frame_result import FrameResult
+from bikeped.pipeline.loop import FrameResult
 from bikeped.types import Colour, Kind
 
 REASSURING = {Colour.BLUE, Colour.GREEN}

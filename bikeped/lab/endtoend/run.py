@@ -19,8 +19,7 @@ from bikeped.lab.simulation.simulate import FPS
 from bikeped.pipeline.application import load_detector_pool
 from bikeped.pipeline.detection_scheduler import DetectionStage, FrameDetector
 from bikeped.pipeline.feed import RecordedFeed
-from bikeped.pipeline.frame_result import FrameResult
-from bikeped.pipeline.loop import Loop
+from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Detections
