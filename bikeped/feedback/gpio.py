@@ -119,14 +119,10 @@ def _find_chip(gpiod: Any, wanted: str, chips: Iterable[str] | None) -> str:
             found.append(path)
     if len(found) == 1:
         return found[0]
+    problem = f"no chip has the label or name {wanted!r}; present: {', '.join(seen) or 'none'}"
     if found:
-        raise FeedbackError(
-            f"{SECTION}.chip: {wanted!r} fits {', '.join(found)}; name one of them by its path"
-        )
-    raise FeedbackError(
-        f"{SECTION}.chip: no chip has the label or name {wanted!r}; present: "
-        f"{', '.join(seen) or 'none'}"
-    )
+        problem = f"{wanted!r} fits {', '.join(found)}; name one of them by its path"
+    raise FeedbackError(f"{SECTION}.chip: {problem}")
 
 
 def _check_line(chip: Any, chip_name: str, colour: Colour, line: str | int) -> None:

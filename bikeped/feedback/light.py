@@ -9,6 +9,7 @@ and `python -m bikeped.feedback` (ExecStopPost) then darkens the light.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
@@ -78,16 +79,12 @@ def assign_lamps(wired: Mapping[Colour, Lamp], section: str) -> dict[Colour, Lam
         raise FeedbackError(
             f"{section}: no red lamp is wired, so no ALERT could be shown; set the key of red"
         )
-    seen: dict[str | int, Colour] = {}
-    for colour, lamp in lamps.items():
-        if lamp is None:
-            continue
-        if lamp in seen:
+    for (one, lamp), (other, same) in itertools.combinations(lamps.items(), 2):
+        if lamp is not None and lamp == same:
             raise FeedbackError(
-                f"{section}: {seen[lamp].value} and {colour.value} are both on {lamp!r}; give each "
+                f"{section}: {one.value} and {other.value} are both on {lamp!r}; give each "
                 "its own, or leave one out"
             )
-        seen[lamp] = colour
     if lamps[Colour.ORANGE] is None:
         lamps[Colour.ORANGE] = lamps[Colour.RED]
     return {**lamps, Colour.OFF: None}

@@ -10,7 +10,7 @@ import logging
 import queue
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -150,15 +150,6 @@ class LatestFrameSlot:
         return item
 
 
-async def first_of(future: asyncio.Future[Any], other: Coroutine[Any, Any, object]) -> None:
-    """Returns when one of the two is done; cancels `other`, never `future`."""
-    task = asyncio.ensure_future(other)
-    try:
-        await asyncio.wait({future, task}, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        task.cancel()
-
-
 @dataclass(frozen=True)
 class _InFlight:
     """A frame that a detector thread works on since `began_s`, and its future answer."""
@@ -254,7 +245,12 @@ class DetectionScheduler:
                     await slot.full.wait()
                     continue
                 if self._idle and not slot.ended:
-                    await first_of(inflight[0].answer, slot.full.wait())
+                    full = asyncio.ensure_future(slot.full.wait())
+                    either: set[asyncio.Future[Any]] = {inflight[0].answer, full}
+                    try:
+                        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+                    finally:
+                        full.cancel()
                 else:
                     await asyncio.wait({inflight[0].answer})
                 if not inflight[0].answer.done():

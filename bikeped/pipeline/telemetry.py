@@ -140,9 +140,14 @@ class Telemetry:
         )
 
     def _counters(self, loop: Loop) -> Counters:
+        counts = loop.counts
         return Counters(
-            **vars(loop.counts),
+            received=counts.received,
+            frames=counts.frames,
             dropped=loop.feed.dropped(),
+            undecodable=counts.undecodable,
+            failed=counts.failed,
+            out_of_order=counts.out_of_order,
             alerts=self._alerts.count,
             mqtt_dropped=self._mqtt.status.dropped if self._mqtt else 0,
             audit_dropped=self._audit.dropped if self._audit else 0,
