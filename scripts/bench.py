@@ -26,7 +26,6 @@ from benchmarks.figures import Figures
 
 def main() -> int:
     from benchmarks import (
-        bundled,
         calibration,
         conformance,
         detection,
@@ -43,7 +42,7 @@ def main() -> int:
         "nms": detection.nms,
         "tracking": tracking.run,
         "loop": loop.run,
-        "bundled": bundled.run,
+        "bundled": loop.bundled,
         "conformance": conformance.run,
         "scene": scene.run,
         "calibration": calibration.run,

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from benchmarks.figures import Figures
-    from bikeped.config import LoadedConfig
-    from bikeped.lab.simulation.suite import Suite
+from benchmarks.figures import Figures, in_turns, seconds
+from bikeped.config import LoadedConfig, load_config, rule_settings
+from bikeped.cores import cores
+from bikeped.decision import Decider
+from bikeped.lab.experiments import optimizer
+from bikeped.lab.experiments.reproduce import ReproduceSettings, reproduce
+from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
+from bikeped.lab.simulation.simulate import SIMULATION_TRACKER
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare
+from bikeped.tracking import BatchTracker
 
 
 def run(figures: Figures) -> None:
     """Seven configurations over the bundled scenarios, with and without localisation error."""
-    from benchmarks.figures import in_turns
-    from bikeped.config import load_config, rule_settings
-    from bikeped.decision import Decider
-    from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
-    from bikeped.lab.simulation.simulate import SIMULATION_TRACKER
-    from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare
-    from bikeped.tracking import BatchTracker
-
     loaded = load_config()
     scenarios = load_scenarios(bundled_folder())
 
@@ -41,22 +37,13 @@ def run(figures: Figures) -> None:
                 tracker.update(i / 30, xy[None], kind[None])
                 at = tracker.reported[0]
                 order = tracker.id[0][at].argsort()
-                decider.decide(
-                    i / 30,
-                    tracker.id[0][at][order],
-                    tracker.kind[0][at][order],
-                    tracker.xy_m[0][at][order],
-                )
+                tracks = (tracker.id, tracker.kind, tracker.xy_m)
+                decider.decide(i / 30, *(values[0][at][order] for values in tracks))
 
     a, b = in_turns(ours, obvious_part, 3)
     _searches(figures, Suite.load(scenarios, loaded), loaded, b)
-    figures.add(
-        f"compare {len(CONFIGURATIONS)} configurations, {len(scenarios)} scenarios, twice",
-        a,
-        b * 2 * len(CONFIGURATIONS),
-        "s",
-        "0.5",
-    )
+    what = f"compare {len(CONFIGURATIONS)} configurations, {len(scenarios)} scenarios, twice"
+    figures.add(what, a, b * 2 * len(CONFIGURATIONS), "s", "0.5")
 
 
 def _searches(figures: Figures, suite: Suite, loaded: LoadedConfig, one_pass_s: float) -> None:
@@ -64,18 +51,10 @@ def _searches(figures: Figures, suite: Suite, loaded: LoadedConfig, one_pass_s: 
 
     It is not run for half an hour: one pass was measured, the rest is arithmetic.
     """
-    from bikeped.cores import cores
-    from bikeped.lab.experiments import optimizer
-    from bikeped.lab.experiments.reproduce import ReproduceSettings, reproduce
-
     count = optimizer.evaluations()
-    began = time.perf_counter()
-    optimizer.optimize(suite, loaded.config.decision)
-    took = time.perf_counter() - began
+    took = seconds(lambda: optimizer.optimize(suite, loaded.config.decision))
     figures.add(f"optimise, {count} evaluations", took, count * one_pass_s, "s", "60")
     trials = ReproduceSettings().trials
     with tempfile.TemporaryDirectory() as folder:
-        began = time.perf_counter()
-        reproduce(suite, loaded, Path(folder), processes=cores())
-        took = time.perf_counter() - began
+        took = seconds(lambda: reproduce(suite, loaded, Path(folder), processes=cores()))
     figures.add(f"reproduce everything, {trials} trials, with figures", took, None, "s", "60")

@@ -18,16 +18,8 @@ class Figures:
     def add(self, what: str, ours: float, obvious: float | None, unit: str, goal: str = "") -> None:
         """One row; the ratio is ours over the obvious."""
         ratio = ours / obvious if obvious else None
-        self.rows.append(
-            {
-                "what": what,
-                "ours": ours,
-                "obvious": obvious,
-                "unit": unit,
-                "ratio": ratio,
-                "goal": goal,
-            }
-        )
+        row = {"what": what, "ours": ours, "obvious": obvious}
+        self.rows.append(row | {"unit": unit, "ratio": ratio, "goal": goal})
         shown = f"{obvious:12.3f}" if obvious is not None else " " * 12
         share = f"{ratio:8.3f}" if ratio is not None else " " * 8
         print(f"{what:<62}{ours:12.3f}{shown}{share}  {unit:<9}{goal}", flush=True)
@@ -39,10 +31,19 @@ def in_turns(
     """Median seconds of both, measured in turns after one warm-up each."""
     ours()
     obvious()
-    times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(runs):
-        for way, kept in ((ours, times[0]), (obvious, times[1])):
-            began = time.perf_counter()
-            way()
-            kept.append(time.perf_counter() - began)
-    return statistics.median(times[0]), statistics.median(times[1])
+    times = [(seconds(ours), seconds(obvious)) for _ in range(runs)]
+    return statistics.median(a for a, _ in times), statistics.median(b for _, b in times)
+
+
+def median_s(work: Callable[[], object], runs: int) -> float:
+    """Median seconds after one warm-up (none for a single run, which takes seconds)."""
+    if runs > 1:
+        work()
+    return statistics.median(seconds(work) for _ in range(runs))
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """How long it takes."""
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began

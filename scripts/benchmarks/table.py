@@ -6,12 +6,12 @@ import multiprocessing
 import time
 import tracemalloc
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from benchmarks.figures import Figures
+from benchmarks.figures import Figures
+from bikeped.config import framing, ground_camera, load_config
+from bikeped.geometry import GroundTable
 
 
 def _measured(build: Callable[[], float]) -> tuple[float, float, float]:
@@ -30,9 +30,6 @@ def _measured(build: Callable[[], float]) -> tuple[float, float, float]:
 
 
 def _ours() -> tuple[float, float, float]:
-    from bikeped.config import framing, ground_camera, load_config
-    from bikeped.geometry import GroundTable
-
     loaded = load_config()
     camera, size = ground_camera(loaded), framing(loaded).crop_wh
     GroundTable(camera, 64, 64)
@@ -41,8 +38,6 @@ def _ours() -> tuple[float, float, float]:
 
 def _obvious() -> tuple[float, float, float]:
     """Equations 1 to 5 of the paper over the whole pixel grid, in float64, x, y and z kept."""
-    from bikeped.config import framing, ground_camera, load_config
-
     loaded = load_config()
     camera, (width, height) = ground_camera(loaded), framing(loaded).crop_wh
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from benchmarks.figures import Figures
+from benchmarks.figures import Figures, in_turns
+from bikeped.config import load_config, rule_settings, tracker_settings
+from bikeped.decision import Decider
+from bikeped.tracking import Tracker
+from bikeped.types import GroundPoints
 
 FRAMES = 60
 GOALS_MS = {10: 0.3, 50: 0.8, 200: 4.0}
@@ -16,45 +19,38 @@ GOALS_MS = {10: 0.3, 50: 0.8, 200: 4.0}
 
 def run(figures: Figures) -> None:
     """Walkers and cyclists in equal number on 40 x 40 m, with 3 cm of noise."""
-    from benchmarks.figures import in_turns
-    from bikeped.config import load_config, rule_settings, tracker_settings
-    from bikeped.decision import Decider
-    from bikeped.tracking import Tracker
-    from bikeped.types import GroundPoints
-
-    config = load_config().config
     for count, goal in GOALS_MS.items():
-        rng = np.random.default_rng(count)
-        start = rng.uniform(-20, 20, (count, 2))
-        velocity = rng.normal(0, 1.5, (count, 2))
-        kind = (np.arange(count) % 2).astype(np.int8)
-        scenes = []
-        for i in range(FRAMES):
-            order = rng.permutation(count)
-            xy = start + velocity * i / 30 + rng.normal(0, 0.03, (count, 2))
-            scenes.append((kind[order], xy[order]))
+        _objects(figures, count, goal)
 
-        def ours(scenes: list[Any] = scenes) -> None:
-            tracker = Tracker(tracker_settings(config.tracking))
-            decider = Decider(rule_settings(config.decision))
-            for i, (kinds, xy) in enumerate(scenes):
-                points = GroundPoints(kinds, xy, np.arange(len(kinds)))
-                tracks = tracker.update(points, i / 30)
-                decider.decide(i / 30, tracks.id, tracks.kind, tracks.xy_m)
 
-        def obvious(scenes: list[Any] = scenes) -> None:
-            plain = PlainPole()
-            for kinds, xy in scenes:
-                plain.step(kinds.tolist(), xy.tolist())
+def _objects(figures: Figures, count: int, goal_ms: float) -> None:
+    config = load_config().config
+    rng = np.random.default_rng(count)
+    start = rng.uniform(-20, 20, (count, 2))
+    velocity = rng.normal(0, 1.5, (count, 2))
+    kind = (np.arange(count) % 2).astype(np.int8)
+    scenes = []
+    for i in range(FRAMES):
+        order = rng.permutation(count)
+        xy = start + velocity * i / 30 + rng.normal(0, 0.03, (count, 2))
+        scenes.append((kind[order], xy[order]))
 
-        a, b = in_turns(ours, obvious, 5)
-        figures.add(
-            f"tracking and decision, {count} objects, a frame",
-            a / FRAMES * 1e3,
-            b / FRAMES * 1e3,
-            "ms",
-            f"{goal:g}",
-        )
+    def ours() -> None:
+        tracker = Tracker(tracker_settings(config.tracking))
+        decider = Decider(rule_settings(config.decision))
+        for i, (kinds, xy) in enumerate(scenes):
+            points = GroundPoints(kinds, xy, np.arange(len(kinds)))
+            tracks = tracker.update(points, i / 30)
+            decider.decide(i / 30, tracks.id, tracks.kind, tracks.xy_m)
+
+    def obvious() -> None:
+        plain = PlainPole()
+        for kinds, xy in scenes:
+            plain.step(kinds.tolist(), xy.tolist())
+
+    a, b = in_turns(ours, obvious, 5)
+    what = f"tracking and decision, {count} objects, a frame"
+    figures.add(what, a / FRAMES * 1e3, b / FRAMES * 1e3, "ms", f"{goal_ms:g}")
 
 
 class PlainPole:
