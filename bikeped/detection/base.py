@@ -109,16 +109,22 @@ def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None =
             "detection.model: no model is configured; name an .onnx or .engine file, or bundled"
         )
     path = model_file(config.model, base_dir)
+    from bikeped.detection.detector import Backend, NetworkDetector
+
     # Imported where needed: an .engine does not need onnxruntime, nor an .onnx file tensorrt.
     if path.suffix.lower() == ".onnx":
-        from bikeped.detection.onnx_runtime import OnnxDetector, runs_on_cpu
+        from bikeped.detection.onnx_runtime import OnnxBackend, runs_on_cpu
 
         path = model_file(config.model, base_dir, on_cpu=runs_on_cpu(config.providers))
-        return OnnxDetector(path, config, verify_sha256(path, config.sha256), road)
-    if path.suffix.lower() == ".engine":
-        from bikeped.detection.trt_engine import EngineDetector
+        digest = verify_sha256(path, config.sha256)
+        backend: Backend = OnnxBackend(path, config, digest, road)
+    elif path.suffix.lower() == ".engine":
+        from bikeped.detection.trt_engine import EngineBackend
 
-        return EngineDetector(path, config, verify_sha256(path, config.sha256), road=road)
-    raise DetectorError(
-        f"detection.model: {path} is neither .onnx nor .engine; export the model to one of them"
-    )
+        digest = verify_sha256(path, config.sha256)
+        backend = EngineBackend(path, config, road)
+    else:
+        raise DetectorError(
+            f"detection.model: {path} is neither .onnx nor .engine; export the model to one of them"
+        )
+    return NetworkDetector(path, config, digest, backend)

@@ -60,6 +60,11 @@ class Backend(Protocol):
     def metadata(self) -> ModelMetadata: ...
 
     @property
+    def region(self) -> Region | None:
+        """The part of every frame that the network sees; None: all."""
+        ...
+
+    @property
     def buffer(self) -> npt.NDArray[Any]:
         """The network's input [1, 3, height, width], to be filled before `run`."""
         ...
@@ -76,17 +81,9 @@ class NetworkDetector:
     """A `Detector` around a backend."""
 
     def __init__(
-        self,
-        path: Path,
-        config: DetectionConfig,
-        model_hash: str,
-        backend: Backend,
-        region: Region | None = None,
+        self, path: Path, config: DetectionConfig, model_hash: str, backend: Backend
     ) -> None:
-        """Warms up the network on a grey image and chooses the layout by its output.
-
-        `region`: the part of every frame that the network sees; None: all.
-        """
+        """Warms up the network on a grey image and chooses the layout by its output."""
         self._backend = backend
         self._config = config
         self._source = str(path)
@@ -115,14 +112,14 @@ class NetworkDetector:
         ).astype(np.float32)
         family, why = _family(choice.layout, metadata, config, path)
         self.family: Family = family
-        self._preprocess = Preprocessor(family, backend.buffer, region)
+        self._preprocess = Preprocessor(family, backend.buffer, backend.region)
         log.info(
             "%s: %s, input %d x %d, region %s, layout %s (%s), preprocessing %s (%s), %d classes",
             path,
             backend.description,
             width,
             height,
-            "frame" if region is None else f"road ({_shares(region)})",
+            "frame" if backend.region is None else f"road ({_shares(backend.region)})",
             choice.layout,
             choice.reason,
             family,
@@ -130,9 +127,7 @@ class NetworkDetector:
             len(names),
         )
         # Once more through every stage, for grid tables, canvases and the runtime's caches.
-        self.infer(
-            np.full((height, width, 3), PAD, np.uint8), self.input_size[0], self.input_size[1]
-        )
+        self.infer(np.full((height, width, 3), PAD, np.uint8), *self.input_size)
 
     @property
     def name(self) -> str:
@@ -171,14 +166,8 @@ class NetworkDetector:
         letterbox = self._preprocess(rgb, frame_width, frame_height)
         output = self._run()
         users = self._decode_road_users(output)
-        every = decode(
-            output,
-            self.layout,
-            self.input_size,
-            confidence,
-            np.ones_like(self._wanted),
-            self._source,
-        )
+        wanted = np.ones_like(self._wanted)
+        every = decode(output, self.layout, self.input_size, confidence, wanted, self._source)
         box = _to_frame(every.box, letterbox)
         kept = _has_area(box)
         candidates = Candidates(box[kept], every.score[kept], every.class_id[kept])
@@ -224,12 +213,9 @@ class NetworkDetector:
 
         Where a cyclist's box includes the rider, pedestrians and cyclists suppress one another.
         """
-        group = (
-            np.where(kind == Kind.CYCLIST, Kind.PEDESTRIAN, kind)
-            if self.cyclist_box_includes_rider
-            else kind
-        )
-        return non_max_suppression(box, score, group, self._config.iou, self._config.max_detections)
+        if self.cyclist_box_includes_rider:
+            kind = np.where(kind == Kind.CYCLIST, np.int8(Kind.PEDESTRIAN), kind)
+        return non_max_suppression(box, score, kind, self._config.iou, self._config.max_detections)
 
 
 def _shares(region: Region) -> str:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 import onnxruntime as ort
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.model_metadata import (
     ModelMetadata,
     choose_region,
@@ -37,28 +36,15 @@ _INPUT_TYPES = {
 _ERRORS_ONLY = 3  #: ONNX Runtime's log severity; its warnings are about optimisation
 
 
-class OnnxDetector(NetworkDetector):
-    """A `Detector` for an `.onnx` file."""
-
-    def __init__(
-        self, path: Path, config: DetectionConfig, model_hash: str, road: Region | None = None
-    ) -> None:
-        """Opens and warms up the model; `road` as for `load_detector`.
-
-        Raises `DetectorError` where that fails.
-        """
-        backend = OnnxBackend(path, config, model_hash, road)
-        super().__init__(path, config, model_hash, backend, backend.region)
-
-
 class OnnxBackend:
     """An ONNX Runtime session with one input array that is reused."""
 
     def __init__(
         self, path: Path, config: DetectionConfig, model_hash: str, road: Region | None = None
     ) -> None:
-        """`model_hash` names the cache folder of the engines that TensorRT builds.
+        """Opens the model; `road` as for `load_detector`. Raises `DetectorError` where that fails.
 
+        `model_hash` names the cache folder of the engines that TensorRT builds.
         ONNX Runtime names a cached engine after the graph, not the weights: in a common folder, a
         retrained model would run with the old one's engine.
         """

@@ -24,7 +24,6 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.model_metadata import (
     ModelMetadata,
     choose_region,
@@ -147,25 +146,6 @@ def _load() -> Any:
     )
 
 
-class EngineDetector(NetworkDetector):
-    """A `Detector` for an `.engine` file."""
-
-    def __init__(
-        self,
-        path: Path,
-        config: DetectionConfig,
-        model_hash: str,
-        cuda: Cuda | None = None,
-        road: Region | None = None,
-    ) -> None:
-        """Loads and warms up the engine; `road` as `load_detector` has it.
-
-        Raises `DetectorError` where that fails.
-        """
-        region = choose_region(config, road, False)  # an engine's input is of one size
-        super().__init__(path, config, model_hash, EngineBackend(path, cuda), region)
-
-
 def split_header(data: bytes) -> tuple[Mapping[str, object], memoryview]:
     """Ultralytics' metadata (empty where there is none) and the engine itself.
 
@@ -186,8 +166,10 @@ def split_header(data: bytes) -> tuple[Mapping[str, object], memoryview]:
 class EngineBackend:
     """An engine, its execution context, and one buffer a tensor on either side."""
 
-    def __init__(self, path: Path, cuda: Cuda | None = None) -> None:
+    def __init__(self, path: Path, config: DetectionConfig, road: Region | None = None) -> None:
+        """Loads the engine; `road` as for `load_detector`. Raises `DetectorError`."""
         self._source = str(path)
+        self.region = choose_region(config, road, False)  # an engine's input is of one size
         trt = _import(path)
         try:
             data = path.read_bytes()
@@ -196,7 +178,7 @@ class EngineBackend:
         header, plan = split_header(data)
         self.metadata: ModelMetadata = parse_metadata(header, self._source)
         self._version = str(trt.__version__)
-        self._cuda = cuda if cuda is not None else Cuda()
+        self._cuda = Cuda()
         # Logger and runtime must outlive the engine.
         self._logger = trt.Logger(trt.Logger.WARNING)
         self._runtime = trt.Runtime(self._logger)

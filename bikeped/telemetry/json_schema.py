@@ -12,7 +12,8 @@ from typing import Any
 
 import msgspec
 
-from bikeped.errors import TelemetryError
+from bikeped.errors import BikepedError
+from bikeped.files import make_folder, write_whole
 from bikeped.telemetry import schema as messages
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -35,42 +36,27 @@ def schema(name: str) -> dict[str, Any]:
 
 
 def schema_files() -> dict[str, str]:
-    """File name -> text of every schema, as `write` writes them."""
+    """File name -> text of every schema."""
     return {
         f"{name}.schema.json": json.dumps(schema(name), indent=2, ensure_ascii=False) + "\n"
         for name in MESSAGES
     }
 
 
-def write(directory: Path) -> list[Path]:
-    """Writes every schema into `directory`, creating it; returns the paths.
-
-    Raises TelemetryError when the directory cannot be written.
-    """
-    paths = {directory / name: text for name, text in schema_files().items()}
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        for path, text in paths.items():
-            path.write_text(text, encoding="utf-8")
-    except OSError as exc:
-        raise TelemetryError(
-            f"{exc.filename or directory}: cannot write the schemas ({exc.strerror}): "
-            "give a directory that you may write"
-        ) from exc
-    return list(paths)
-
-
 def main(arguments: list[str]) -> int:
-    """Writes the schemas into the one directory named; returns the exit status."""
+    """Writes the schemas into the one directory named, creating it; returns the exit status."""
     if len(arguments) != 1:
         print("usage: python -m bikeped.telemetry.json_schema DIRECTORY", file=sys.stderr)
-        return TelemetryError.exit_status
+        return BikepedError.exit_status
+    directory = Path(arguments[0])
     try:
-        for path in write(Path(arguments[0])):
-            print(path)
-    except TelemetryError as exc:
-        print(exc, file=sys.stderr)
-        return exc.exit_status
+        make_folder(directory, "directory")
+        for name, text in schema_files().items():
+            write_whole(directory / name, text)
+            print(directory / name)
+    except BikepedError as error:
+        print(error, file=sys.stderr)
+        return error.exit_status
     return 0
 
 

@@ -356,7 +356,7 @@ def test_the_schemas_command(tmp_path: Path):
     refused = run(str(tmp_path / "file"))
     assert refused.returncode == 2
     assert len(refused.stderr.splitlines()) == 1
-    assert "cannot write the schemas" in refused.stderr
+    assert "file: cannot be made" in refused.stderr
 
 
 def test_the_examples_in_the_documentation_are_valid_and_complete():

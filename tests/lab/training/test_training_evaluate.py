@@ -34,6 +34,7 @@ class Told:
     """A network that answers what it is told: rows of class, box (x, y, w, h), score a picture."""
 
     description = "told"
+    region = None
     metadata = ModelMetadata(names=NAMES, end_to_end=True)
 
     def __init__(self, *pictures):
