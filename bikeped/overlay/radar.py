@@ -28,7 +28,7 @@ from bikeped.overlay.drawing import (
     text_size,
 )
 from bikeped.overlay.overlay_data import OverlayData
-from bikeped.types import BoolArray, FloatArray, ImageArray, Kind
+from bikeped.types import FloatArray, ImageArray, Kind
 
 RING_STEP_M = 5.0
 #: An arrow shows where its object will be after this long.
@@ -83,44 +83,125 @@ def draw_radar(
     `heading_deg`: the optical axis, to the right of the ground frame's x axis; it turns the
     field of view's wedge. Tracks beyond `range_m` are drawn as marks on the outermost ring.
     """
-    frame = RadarProjection.fit(size[0], size[1], range_m)
-    image = _base(frame, fov_deg, heading_deg).copy()
-    text = _text_height(size)
-    tracks = data.tracks
-    rows = data.pair_rows()
-    reach = np.hypot(tracks.xy_m[:, 0], tracks.xy_m[:, 1])
-    near = reach <= range_m
-    taken: list[Rect] = []
-    paired = rows if rows is not None and near[list(rows)].all() else None
+    return _RadarView(data, size, range_m, fov_deg, heading_deg).draw()
 
-    _draw_trails(image, frame, data, near)
-    if paired is not None:
-        _draw_pair(image, frame, data, paired)
-    labels: list[tuple[bool, int, FloatArray]] = []
-    for row in range(len(tracks)):
-        kind = Kind(int(tracks.kind[row]))
-        at = frame.pixels(tracks.xy_m[row])
-        if not near[row]:
-            rim = frame.pixels(tracks.xy_m[row] / max(reach[row], 1e-9) * range_m)
-            circle(image, rim, text * 0.35, shade(KIND_COLOUR[kind], 0.7))
-            continue
-        in_pair = rows is not None and row in rows
-        if in_pair and data.alerting:
-            circle(image, at, text * 1.45, SIGNAL_COLOUR["ALERT"], max(round(text / 4), 2))
-        velocity = tracks.velocity_mps[row]
-        if np.hypot(*velocity) > 0.3:
-            tip = frame.pixels(tracks.xy_m[row] + velocity * ARROW_S)
-            arrow(image, at, tip, KIND_COLOUR[kind], max(round(text / 7), 1), text * 0.6)
-        heading = math.atan2(velocity[1], velocity[0])
-        _symbol(image, kind, at, text * 0.62, heading, unseen=bool(tracks.detection[row] < 0))
-        labels.append((in_pair, row, at))
-    if paired is not None:
-        _draw_distance(image, frame, data, paired, text, taken)
-    labels.sort(key=lambda item: not item[0])
-    for _, row, at in labels:
-        _draw_label(image, data, row, at, text, taken)
-    _draw_list(image, frame, data, reach, text)
-    return image
+
+class _RadarView:
+    """One radar picture in the making."""
+
+    def __init__(
+        self,
+        data: OverlayData,
+        size: tuple[int, int],
+        range_m: float,
+        fov_deg: float,
+        heading_deg: float,
+    ) -> None:
+        self.frame = RadarProjection.fit(*size, range_m)
+        self.image = _base(self.frame, fov_deg, heading_deg).copy()
+        self.data, self.tracks, self.text = data, data.tracks, _text_height(size)
+        self.at = self.frame.pixels(data.tracks.xy_m)
+        self.reach = np.hypot(*data.tracks.xy_m.T)
+        self.near = self.reach <= range_m
+        self.taken: list[Rect] = []
+
+    def draw(self) -> ImageArray:
+        """The finished picture."""
+        image, text, data, tracks = self.image, self.text, self.data, self.tracks
+        rows = data.pair_rows() or ()
+        ends = self.at[list(rows)] if rows and self.near[list(rows)].all() else None
+        self._draw_trails()
+        if ends is not None and data.alerting:
+            polyline(image, ends, PAPER, 5)
+            polyline(image, ends, data.pair_colour, 3)
+        elif ends is not None:
+            dashed(image, ends, data.pair_colour, 2, 6.0)
+        for row in range(len(tracks)):
+            kind, at = Kind(int(tracks.kind[row])), self.at[row]
+            if not self.near[row]:
+                rim = tracks.xy_m[row] / max(self.reach[row], 1e-9) * self.frame.range_m
+                circle(image, self.frame.pixels(rim), text * 0.35, shade(KIND_COLOUR[kind], 0.7))
+                continue
+            if row in rows and data.alerting:
+                circle(image, at, text * 1.45, SIGNAL_COLOUR["ALERT"], max(round(text / 4), 2))
+            velocity = tracks.velocity_mps[row]
+            if np.hypot(*velocity) > 0.3:
+                tip = self.frame.pixels(tracks.xy_m[row] + velocity * ARROW_S)
+                arrow(image, at, tip, KIND_COLOUR[kind], max(round(text / 7), 1), text * 0.6)
+            heading = math.atan2(velocity[1], velocity[0])
+            _symbol(image, kind, at, text * 0.62, heading, unseen=bool(tracks.detection[row] < 0))
+        if ends is not None:
+            self._draw_distance(ends)
+        for row in sorted(np.flatnonzero(self.near).tolist(), key=lambda row: row not in rows):
+            self._draw_label(row)
+        self._draw_list()
+        return image
+
+    def _draw_trails(self) -> None:
+        tracks = self.tracks
+        kinds = dict(
+            zip(tracks.id[self.near].tolist(), tracks.kind[self.near].tolist(), strict=True)
+        )
+        for track_id, trail in self.data.history.items():
+            if track_id not in kinds or len(trail) < 2:
+                continue
+            points, middle = self.frame.pixels(trail), len(trail) // 2
+            colour = KIND_COLOUR[Kind(kinds[track_id])]
+            # Older parts are darker, so that the trail shows the direction.
+            polyline(self.image, points[: middle + 1], shade(colour, 0.4), 2)
+            polyline(self.image, points[middle:], shade(colour, 0.65), 2)
+
+    def _draw_distance(self, ends: FloatArray) -> None:
+        """The pair's distance on its line, above arrows and symbols."""
+        pair = self.data.decision.pair
+        if pair is None:
+            return
+        word = f"{pair.distance_m:.1f} m"
+        if np.hypot(*(ends[1] - ends[0])) < text_size(word, self.text, True)[0] + 4 * self.text:
+            return  # no room on the line; the list below has the distance
+        u, v = ends.mean(axis=0)
+        self.taken.append(draw_tag(self.image, word, (u, v), self.text, self.data.pair_colour))
+
+    def _draw_label(self, row: int) -> None:
+        text, word, (u, v) = self.text, str(self.tracks.id[row]), self.at[row]
+        reach = text * 1.1
+        size = (float(text_size(word, text, True)[0] + 4), text + 4.0)
+        bounds: Rect = (0, 0, self.frame.width, self.frame.height)
+        box: Rect = (u - reach, v - reach, u + reach, v + reach)
+        spot = place_label(size, box, self.taken, bounds, gap=0)
+        self.taken.append(spot)
+        colour = KIND_COLOUR[Kind(int(self.tracks.kind[row]))]
+        draw_text(self.image, word, (spot[0] + 2, spot[1] + 2), text, colour, bold=True)
+
+    def _draw_list(self) -> None:
+        """Table of the tracks below the radar, nearest first, as many as fit."""
+        image, frame, tracks, text = self.image, self.frame, self.tracks, self.text
+        top = frame.v0 + frame.range_m * frame.px_per_m * _BEHIND + text * 1.6
+        line = text * 2.1
+        room = int((frame.height - top - text * 0.6) / line)
+        if room < 2:
+            return
+        left = frame.u0 - frame.range_m * frame.px_per_m
+        width = 2 * frame.range_m * frame.px_per_m
+        name_x, columns = left + text * 2.2, [left + width * share for share in (0.56, 0.78, 1)]
+
+        def draw_row(y: float, name: str, words: tuple[str, str], ink: Rgb) -> None:
+            draw_text(image, name, (name_x, y), text, ink)
+            for x, word in zip(columns, words, strict=False):
+                draw_text(image, word, (x, y), text, ink, anchor="right")
+
+        draw_row(top, "track", ("distance", "speed"), _FAINT)
+        order = np.argsort(self.reach, kind="stable").tolist()
+        for i, row in enumerate(order[: room - 1]):
+            y = top + (i + 1) * line
+            kind, unseen = Kind(int(tracks.kind[row])), bool(tracks.detection[row] < 0)
+            at = np.array([left + text * 0.8, y + text / 2])
+            _symbol(image, kind, at, text * 0.55, 0.0, unseen=unseen)
+            speed = f"{np.hypot(*tracks.velocity_mps[row]):.1f} m/s"
+            name = f"{kind.label} {tracks.id[row]}"
+            draw_row(y, name, (f"{self.reach[row]:.1f} m", speed), PAPER)
+            if unseen:
+                draw_text(image, "unseen", (columns[2], y), text, _FAINT, anchor="right")
 
 
 def _text_height(size: tuple[int, int]) -> int:
@@ -168,56 +249,6 @@ def _base(frame: RadarProjection, fov_deg: float, heading_deg: float) -> ImageAr
     return image
 
 
-def _draw_trails(
-    image: ImageArray, frame: RadarProjection, data: OverlayData, near: BoolArray
-) -> None:
-    tracks = data.tracks
-    kinds = dict(zip(tracks.id[near].tolist(), tracks.kind[near].tolist(), strict=True))
-    for track_id, trail in data.history.items():
-        if track_id not in kinds or len(trail) < 2:
-            continue
-        points = frame.pixels(trail)
-        colour = KIND_COLOUR[Kind(kinds[track_id])]
-        # Older parts are darker, so that the trail shows the direction.
-        for part, fade in (
-            (points[: len(points) // 2 + 1], 0.4),
-            (points[len(points) // 2 :], 0.65),
-        ):
-            polyline(image, part, shade(colour, fade), 2)
-
-
-def _draw_pair(
-    image: ImageArray, frame: RadarProjection, data: OverlayData, rows: tuple[int, int]
-) -> None:
-    ends = frame.pixels(data.tracks.xy_m[list(rows)])
-    colour = data.pair_colour
-    if data.alerting:
-        polyline(image, ends, PAPER, 5)
-        polyline(image, ends, colour, 3)
-    else:
-        dashed(image, ends, colour, 2, 6.0)
-
-
-def _draw_distance(
-    image: ImageArray,
-    frame: RadarProjection,
-    data: OverlayData,
-    rows: tuple[int, int],
-    text: int,
-    taken: list[Rect],
-) -> None:
-    """The pair's distance on its line, above arrows and symbols."""
-    pair = data.decision.pair
-    if pair is None:
-        return
-    ends = frame.pixels(data.tracks.xy_m[list(rows)])
-    word = f"{pair.distance_m:.1f} m"
-    if np.hypot(*(ends[1] - ends[0])) < text_size(word, text, True)[0] + 4 * text:
-        return  # no room on the line; the list below has the distance
-    u, v = ends.mean(axis=0)
-    taken.append(draw_tag(image, word, (u, v), text, data.pair_colour))
-
-
 def _rotation(angle_rad: float) -> FloatArray:
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, s], [-s, c]])
@@ -244,49 +275,3 @@ def _symbol(
     polygon(image, at + offset * radius * 1.15, colour)
     if unseen:
         polygon(image, at + offset * radius * 0.6, _GROUND)
-
-
-def _draw_label(
-    image: ImageArray, data: OverlayData, row: int, at: FloatArray, text: int, taken: list[Rect]
-) -> None:
-    word = str(data.tracks.id[row])
-    reach = text * 1.1
-    box: Rect = (at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach)
-    h, w = image.shape[:2]
-    size = (float(text_size(word, text, True)[0] + 4), text + 4.0)
-    spot = place_label(size, box, taken, (0, 0, w, h), gap=0)
-    taken.append(spot)
-    kind = Kind(int(data.tracks.kind[row]))
-    draw_text(image, word, (spot[0] + 2, spot[1] + 2), text, KIND_COLOUR[kind], bold=True)
-
-
-def _draw_list(
-    image: ImageArray, frame: RadarProjection, data: OverlayData, reach: FloatArray, text: int
-) -> None:
-    """Table of the tracks below the radar, nearest first, as many as fit."""
-    tracks = data.tracks
-    top = frame.v0 + frame.range_m * frame.px_per_m * _BEHIND + text * 1.6
-    line = text * 2.1
-    room = int((frame.height - top - text * 0.6) / line)
-    if room < 2:
-        return
-    left = frame.u0 - frame.range_m * frame.px_per_m
-    width = 2 * frame.range_m * frame.px_per_m
-    columns = [left + text * 2.2, left + width * 0.56, left + width * 0.78, left + width]
-    for x, word in zip(columns[1:], ("distance", "speed", ""), strict=True):
-        draw_text(image, word, (x, top), text, _FAINT, anchor="right")
-    draw_text(image, "track", (columns[0], top), text, _FAINT)
-    order = np.argsort(reach, kind="stable").tolist()
-    for i, row in enumerate(order[: room - 1]):
-        y = top + (i + 1) * line
-        kind = Kind(int(tracks.kind[row]))
-        unseen = bool(tracks.detection[row] < 0)
-        at = np.array([left + text * 0.8, y + text / 2])
-        _symbol(image, kind, at, text * 0.55, 0.0, unseen=unseen)
-        draw_text(image, f"{kind.label} {tracks.id[row]}", (columns[0], y), text, PAPER)
-        far = f"{reach[row]:.1f} m"
-        draw_text(image, far, (columns[1], y), text, PAPER, anchor="right")
-        speed = f"{np.hypot(*tracks.velocity_mps[row]):.1f} m/s"
-        draw_text(image, speed, (columns[2], y), text, PAPER, anchor="right")
-        if unseen:
-            draw_text(image, "unseen", (columns[3], y), text, _FAINT, anchor="right")

@@ -34,8 +34,7 @@ from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import load_detector_pool
 from bikeped.pipeline.detection_scheduler import DecodedFrame
 from bikeped.pipeline.track_and_decide import GroundMapper
-from bikeped.telemetry.mqtt_auth import load_credentials
-from bikeped.telemetry.mqtt_connection import BrokerConnection
+from bikeped.telemetry.mqtt_connection import BrokerConnection, load_credentials
 from bikeped.types import Frame, Sound
 
 Status = Literal["ok", "warn", "fail", "skipped"]

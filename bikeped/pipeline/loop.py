@@ -23,7 +23,7 @@ import numpy as np
 
 from bikeped.detection.base import DetectionResult
 from bikeped.faults import Fault
-from bikeped.overlay import GroundToFrame, OverlayData, ground_projector
+from bikeped.overlay.overlay_data import GroundToFrame, OverlayData, ground_projector
 from bikeped.pipeline.detection_scheduler import (
     DecodedFrame,
     DetectionScheduler,

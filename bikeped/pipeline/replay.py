@@ -18,7 +18,8 @@ from bikeped.config import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback.light import LightDriver, SimulatedLight
-from bikeped.overlay import VideoWriter, compose
+from bikeped.overlay.compose import compose
+from bikeped.overlay.video_writer import VideoWriter
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_scheduler import FrameDetector
 from bikeped.pipeline.feed import RecordedFeed

@@ -21,8 +21,13 @@ from bikeped import __version__
 from bikeped.config.schema import MqttConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.homeassistant import discovery_messages
-from bikeped.telemetry.mqtt_auth import load_credentials, sends_password_in_clear
-from bikeped.telemetry.mqtt_connection import BrokerConnection, BrokerRefusedError, MqttMessage
+from bikeped.telemetry.mqtt_connection import (
+    BrokerConnection,
+    BrokerRefusedError,
+    MqttMessage,
+    load_credentials,
+    sends_password_in_clear,
+)
 
 log = logging.getLogger(__name__)
 

@@ -7,17 +7,12 @@ import pytest
 from bikeped.errors import CaptureError
 from bikeped.faults import Fault
 from bikeped.geometry import Framing, GroundCamera, Lens
-from bikeped.overlay import (
-    OverlayData,
-    RadarProjection,
-    VideoWriter,
-    compose,
-    draw_overlay,
-    draw_radar,
-    encode_jpeg,
-    ground_projector,
-)
+from bikeped.overlay.camera_view import draw_overlay
+from bikeped.overlay.compose import compose, encode_jpeg
 from bikeped.overlay.drawing import INK, KIND_COLOUR, SIGNAL_COLOUR
+from bikeped.overlay.overlay_data import OverlayData, ground_projector
+from bikeped.overlay.radar import RadarProjection, draw_radar
+from bikeped.overlay.video_writer import VideoWriter
 from bikeped.types import Colour, Decision, Detections, Kind, PairMetrics, Signal, State, Tracks
 
 GREY = np.full((432, 768, 3), 120, np.uint8)

@@ -12,7 +12,7 @@ import pytest
 from bikeped.config.schema import MqttConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.mqtt import MqttPublisher
-from bikeped.telemetry.mqtt_auth import load_credentials, sends_password_in_clear
+from bikeped.telemetry.mqtt_connection import load_credentials, sends_password_in_clear
 
 
 @pytest.mark.parametrize(
