@@ -88,12 +88,8 @@ class Region:
         """First column and row, and those after the last, in a copy of the frame of this size."""
         u1 = min(round(self.left * width_px), width_px - 1)
         v1 = min(round(self.top * height_px), height_px - 1)
-        return (
-            u1,
-            v1,
-            max(round(self.right * width_px), u1 + 1),
-            max(round(self.bottom * height_px), v1 + 1),
-        )
+        u2, v2 = round(self.right * width_px), round(self.bottom * height_px)
+        return u1, v1, max(u2, u1 + 1), max(v2, v1 + 1)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from bikeped.capture.opencv import (
     OpenCapture,
     as_rgb,
     fourcc_text,
+    frame_size,
     silence_opencv,
     usable_fps,
 )
@@ -90,7 +91,10 @@ class V4l2Source(FrameSource):
     def read(self) -> Frame:
         repeating_since_s: float | None = None
         while True:
-            ok, data = self._grab()
+            try:
+                ok, data = self._capture.read()
+            except cv2.error as error:
+                raise CaptureError(f"{self.name}: cannot be read ({error.err})") from error
             if not ok or data is None or data.size == 0:
                 raise CaptureError(f"{self.name}: returned no image; is it still plugged in?")
             stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
@@ -121,18 +125,14 @@ class V4l2Source(FrameSource):
     def _set_up(self, fps: float, fourcc: str) -> float:
         """Sets format, size and rate, in this order; returns the granted rate."""
         capture = self._capture
-        code = cv2.VideoWriter.fourcc(fourcc[0], fourcc[1], fourcc[2], fourcc[3])
-        capture.set(cv2.CAP_PROP_FOURCC, code)
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.height)
         capture.set(cv2.CAP_PROP_FPS, fps)
-        granted = (
-            int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-        )
-        if granted != (self.width, self.height):
+        width, height = frame_size(capture)
+        if (width, height) != (self.width, self.height):
             raise CaptureError(
-                f"{self.name}: grants {granted[0]}x{granted[1]}, not {self.width}x{self.height}; "
+                f"{self.name}: grants {width}x{height}, not {self.width}x{self.height}; "
                 f"set camera.width and camera.height to a size that "
                 f"`v4l2-ctl -d {self.name} --list-formats-ext` shows for {fourcc}"
             )
@@ -151,20 +151,12 @@ class V4l2Source(FrameSource):
             _log.warning("%s: grants %.3g frames per second, not %.3g", self.name, rate, fps)
         return rate
 
-    def _grab(self) -> tuple[bool, ImageArray | None]:
-        try:
-            return self._capture.read()
-        except cv2.error as error:
-            raise CaptureError(f"{self.name}: cannot be read ({error.err})") from error
-
     def _repeated(self, stamp_ms: float, image: bytes | ImageArray) -> bool:
         """Whether this is the last buffer again: same time stamp and same bytes."""
         last, self._last = self._last, (stamp_ms, image)
         if last is None or last[0] != stamp_ms:
             return False
-        if isinstance(image, bytes):
-            return image == last[1]
-        return np.array_equal(image, last[1])
+        return image == last[1] if isinstance(image, bytes) else np.array_equal(image, last[1])
 
     def _frame(self, stamp_ms: float, image: bytes | ImageArray) -> Frame:
         if self._number == 0:
@@ -201,8 +193,6 @@ def trim(data: bytes) -> bytes:
 
     Without an end marker the bytes stay as they are, and the decoder refuses them.
     """
-    if data.endswith(EOI):
-        return data
     end = data.rfind(EOI)
     return data if end < 0 else data[: end + len(EOI)]
 
@@ -237,12 +227,10 @@ class NetworkSource(FrameSource):
             address,
             self.name,
             remedy="is the camera on, and are address, user and password right?",
-            params=[
-                int(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC),
-                OPEN_TIMEOUT_MS,
-                int(cv2.CAP_PROP_READ_TIMEOUT_MSEC),
-                READ_TIMEOUT_MS,
-            ],
+            params={
+                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: OPEN_TIMEOUT_MS,
+                cv2.CAP_PROP_READ_TIMEOUT_MSEC: READ_TIMEOUT_MS,
+            },
             open_capture=open_capture,
         )
         self._opened_s: float | None = clock()  # when the first frame, read by now, arrived

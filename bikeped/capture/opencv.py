@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -62,6 +62,12 @@ def fourcc_text(code: float) -> str:
     return int(code).to_bytes(8, "little")[:4].decode("latin-1").rstrip("\0 ")
 
 
+def frame_size(capture: Capture) -> tuple[int, int]:
+    """Width and height that OpenCV states, pixels."""
+    sides = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+    return int(capture.get(sides[0])), int(capture.get(sides[1]))
+
+
 def usable_fps(fps: float) -> bool:
     """Whether a frame rate is valid; OpenCV gives 0, negative or NaN for none."""
     return math.isfinite(fps) and 0.0 < fps <= MAX_FPS
@@ -102,16 +108,13 @@ class FfmpegReader:
         label: str,
         *,
         remedy: str,
-        params: Sequence[int] = (),
+        params: Mapping[int, int] | None = None,
         open_capture: OpenCapture = cv2.VideoCapture,
     ) -> None:
         self._address, self._label, self._remedy = address, label, remedy
         # No hardware decoding: two runs over one recording must give the same bytes.
-        self._params = [
-            int(cv2.CAP_PROP_HW_ACCELERATION),
-            int(cv2.VIDEO_ACCELERATION_NONE),
-            *params,
-        ]
+        options = {cv2.CAP_PROP_HW_ACCELERATION: cv2.VIDEO_ACCELERATION_NONE, **(params or {})}
+        self._params = [int(number) for option in options.items() for number in option]
         self._open_capture = open_capture
         self._capture = self._open()
         self.raw = self._request_raw()  #: whether images come as JPEG
@@ -127,7 +130,9 @@ class FfmpegReader:
         self._first: RawImage | None = first
         self.fps = self._capture.get(cv2.CAP_PROP_FPS)
         self.expected_frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        self.width, self.height = self._size(first)
+        self.width, self.height = (
+            frame_size(self._capture) if first.rgb is None else first.rgb.shape[1::-1]
+        )
 
     def read(self) -> RawImage | None:
         """The next image, or None at the end of a file or stream."""
@@ -169,18 +174,9 @@ class FfmpegReader:
         if image is None or image.jpeg is None or not image.jpeg.startswith(SOI):
             return False
         try:
-            return read_size(image.jpeg) == self._stated_size()
+            return read_size(image.jpeg) == frame_size(self._capture)
         except CaptureError:
             return False
-
-    def _stated_size(self) -> tuple[int, int]:
-        get = self._capture.get
-        return int(get(cv2.CAP_PROP_FRAME_WIDTH)), int(get(cv2.CAP_PROP_FRAME_HEIGHT))
-
-    def _size(self, image: RawImage) -> tuple[int, int]:
-        if image.rgb is None:
-            return self._stated_size()
-        return image.rgb.shape[1], image.rgb.shape[0]
 
     def _read(self) -> RawImage | None:
         try:

@@ -72,10 +72,6 @@ class InputSpec:
         """Of the input array."""
         return (1, 3, self.height, self.width)
 
-    def buffer(self) -> npt.NDArray[Any]:
-        """A fresh contiguous input array, zeroed."""
-        return np.zeros(self.shape, self.dtype)
-
 
 def parse_metadata(entries: Mapping[str, object], source: str) -> ModelMetadata:
     """Parses a model's metadata map. Raises `DetectorError` for malformed class names.
@@ -247,8 +243,9 @@ def kind_table(names: tuple[str, ...], config: DetectionConfig, source: str) -> 
     table = np.array([kinds.get(_normalised(name), UNMAPPED) for name in names], np.int8)
     missing = [kind.label for kind in Kind if not (table == kind).any()]
     if len(missing) == len(Kind):
+        shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
         raise DetectorError(
-            f"{source}: none of the model's classes ({_abbreviated(names)}) is named by "
+            f"{source}: none of the model's classes ({shown}) is named by "
             "detection.pedestrian, detection.cyclist or detection.vehicle; name them there"
         )
     for label in missing:
@@ -269,7 +266,3 @@ def cyclist_classes_include_riders(names: tuple[str, ...], kinds: KindArray) -> 
 
 def _normalised(name: str) -> str:
     return name.strip().lower()
-
-
-def _abbreviated(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")

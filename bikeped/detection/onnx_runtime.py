@@ -77,10 +77,11 @@ class OnnxBackend:
         shape = inputs[0].shape
         self.region = choose_region(config, road, is_free(shape))
         spec = resolve_input(inputs[0].name, shape, kind, self.metadata, self._source, self.region)
-        names = {side: size for side, size in zip(shape, spec.shape, strict=True) if _is_name(side)}
+        sides = zip(shape, spec.shape, strict=True)
+        names = {side: size for side, size in sides if isinstance(side, str) and side}
         if names:  # a known size is planned better, and TensorRT needs no range of sizes
             self._session = self._open(config, providers, names)
-        self.buffer: npt.NDArray[Any] = spec.buffer()
+        self.buffer: npt.NDArray[Any] = np.zeros(spec.shape, spec.dtype)
         self._feed = {spec.name: self.buffer}
         self._names: list[str] = [output.name for output in self._session.get_outputs()]
 
@@ -162,10 +163,6 @@ def _options(provider: str, cache: Path, source: str) -> dict[str, str]:
         "trt_timing_cache_enable": "1",
         "trt_timing_cache_path": str(cache),
     }
-
-
-def _is_name(side: object) -> bool:
-    return isinstance(side, str) and side != ""
 
 
 def _line(error: BaseException) -> str:

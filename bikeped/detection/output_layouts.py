@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from bikeped.errors import DetectorError
 from bikeped.types import BoolArray, Float32Array, IntArray
 
 Layout = Literal["yolov5", "yolov8", "end2end", "yolox", "yolox-decoded"]
-LAYOUTS: tuple[Layout, ...] = ("yolov5", "yolov8", "end2end", "yolox", "yolox-decoded")
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 
 #: Detection heads in use: P3-P5, P3-P6 (the large models), P2-P5 (the small-object ones).
 STRIDE_SETS: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32))
@@ -197,7 +197,15 @@ def decode(
             found = _yolov8(output[0], least, wanted, source)
         else:
             found = _with_objectness(output[0], layout, size, least, wanted, source)
-        return _drop_invalid(found)
+        # Rows of invalid numbers are dropped.
+        box, score = found.box, found.score
+        keep = np.isfinite(box).all(axis=1) & (score <= 1 + _SCORE_SLACK)
+        keep &= (box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1])
+        return Candidates(
+            np.ascontiguousarray(box[keep], np.float32),
+            np.minimum(score[keep], np.float32(1)),
+            found.class_id[keep],
+        )
 
 
 def _end2end(
@@ -237,12 +245,11 @@ def _with_objectness(
     wanted: BoolArray,
     source: str,
 ) -> Candidates:
-    if layout == "yolox":
-        strides = strides_of(len(rows), size)
-        if strides is None:
-            raise DetectorError(
-                f"{source}: {len(rows)} rows are not YOLOX's for an input of {size[0]} x {size[1]}"
-            )
+    strides = strides_of(len(rows), size) if layout == "yolox" else ()
+    if strides is None:
+        raise DetectorError(
+            f"{source}: {len(rows)} rows are not YOLOX's for an input of {size[0]} x {size[1]}"
+        )
     if not wanted.any() or len(rows) == 0:
         return _none()
     objectness = rows[:, 4]
@@ -251,8 +258,7 @@ def _with_objectness(
     few = np.nonzero(objectness >= least[wanted].min())[0]
     chosen = rows[few].astype(np.float32)
     box = chosen[:, :4]
-    if layout == "yolox":
-        assert strides is not None  # noqa: S101 - for the type checker; raised above
+    if strides:
         cell, stride = _grid(size, strides)
         box = np.concatenate(
             [(box[:, :2] + cell[few]) * stride[few], np.exp(box[:, 2:]) * stride[few]], axis=1
@@ -270,18 +276,6 @@ def _best_class(
     score = np.take_along_axis(scores, class_id[:, None], axis=1)[:, 0]
     keep = wanted[class_id] & (score >= least[class_id])
     return Candidates(box[keep], score[keep], class_id[keep].astype(np.int64))
-
-
-def _drop_invalid(found: Candidates) -> Candidates:
-    """The candidates without rows of invalid numbers."""
-    box, score = found.box, found.score
-    keep = np.isfinite(box).all(axis=1) & (score <= 1 + _SCORE_SLACK)
-    keep &= (box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1])
-    return Candidates(
-        np.ascontiguousarray(box[keep], np.float32),
-        np.minimum(score[keep], np.float32(1)),
-        found.class_id[keep],
-    )
 
 
 def _check_probabilities(score: npt.NDArray[Any], source: str) -> None:

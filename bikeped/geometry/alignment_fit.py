@@ -32,8 +32,7 @@ from bikeped.geometry.camera import GroundCamera
 from bikeped.types import FloatArray
 
 #: A parameter is undetermined where its standard error exceeds this many of its scales.
-_LIMIT = {"height_m": 3.0, "pitch_deg": 2.0, "radius_px": 3.0, "cx": 4.0, "cy": 4.0}
-_LIMIT_HEADING = 5.0
+_LIMIT = {"height_m": 3, "pitch_deg": 2, "radius_px": 3, "cx": 4, "cy": 4, "heading_deg": 5}
 _MAX_ITERATIONS = 60
 
 
@@ -126,13 +125,8 @@ class _Problem:
                     "above 0"
                 )
             rows.append((f"{marks[i].name}-{marks[j].name}", "spacing", i, j, spacing.distance_m))
-        self.rows = rows
+        self.rows, self.count = rows, len(rows)
         self.measured_m = np.array([row[4] for row in rows])
-
-    @property
-    def count(self) -> int:
-        """Measurements."""
-        return len(self.rows)
 
     def check(self) -> None:
         """Raises GeometryError for marks that no fit can use."""
@@ -302,7 +296,7 @@ class _Problem:
             )
         weight = np.linalg.inv(np.linalg.cholesky(self.residual_covariance(answer[1])))
         _, size, axes = np.linalg.svd(weight @ jacobian, full_matrices=False)
-        limits = np.array([_LIMIT.get(name, _LIMIT_HEADING) for name in self.free])
+        limits = np.array([_LIMIT[name] for name in self.free])
         inverse = 1 / np.maximum(size, 1e-9)
         error = np.sqrt(((axes.T * inverse) ** 2).sum(axis=1))  # in scales
         if (error > limits).any():

@@ -59,21 +59,15 @@ class Framing:
     def offset_px(self) -> tuple[int, int]:
         """Sensor pixel (0, 0) in the crop."""
         (pw, ph), (cw, ch) = self._padded(), self.crop_wh
-        return (
-            (pw - self.sensor_w) // 2 - (pw - cw) // 2,
-            (ph - self.sensor_h) // 2 - (ph - ch) // 2,
-        )
+        left, top = (pw - self.sensor_w) // 2, (ph - self.sensor_h) // 2
+        return left - (pw - cw) // 2, top - (ph - ch) // 2
 
     @property
     def window_px(self) -> tuple[float, float, float, float]:
         """The part of the crop that exists on the sensor: u0, v0, u1, v1, end exclusive."""
         (ox, oy), (cw, ch) = self.offset_px, self.crop_wh
-        return (
-            float(max(ox, 0)),
-            float(max(oy, 0)),
-            float(min(ox + self.sensor_w, cw)),
-            float(min(oy + self.sensor_h, ch)),
-        )
+        right, low = min(ox + self.sensor_w, cw), min(oy + self.sensor_h, ch)
+        return float(max(ox, 0)), float(max(oy, 0)), float(right), float(low)
 
     def for_frame(self, frame_w: int, frame_h: int) -> Framing:
         """The framing of frames of this size, scaled copies of the sensor image.

@@ -81,8 +81,8 @@ def test_any_metadata_is_read_or_refused(entries):
 def test_the_input_size(shape, metadata, size):
     spec = resolve_input("images", shape, np.float16, metadata, "m")
     assert (spec.width, spec.height) == size
-    assert spec.buffer().shape == (1, 3, size[1], size[0])
-    assert spec.buffer().dtype == np.float16
+    assert spec.shape == (1, 3, size[1], size[0])
+    assert spec.dtype == np.float16
 
 
 @pytest.mark.parametrize(
