@@ -17,7 +17,7 @@ from benchmarks.figures import Figures
 from bikeped.config import LoadedConfig, load_config
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.lab.demo import bundled_scenario
+from bikeped.lab.demo.summary import bundled_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.avi_writer import AviWriter
 from bikeped.lab.rendering.clip import encode_jpeg

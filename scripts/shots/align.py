@@ -18,7 +18,7 @@ import numpy as np
 
 from bikeped.config import framing, ground_camera, load_config
 from bikeped.geometry import CameraPose
-from bikeped.lab.demo import bundled_scenario
+from bikeped.lab.demo.summary import bundled_scenario
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter
 from bikeped.lab.scenarios.scenario import load_scenario
 

@@ -133,8 +133,8 @@ def montecarlo(
     configuration's own decision is `configured` when it is none of the named ones.
     """
     require("scipy")
-    from bikeped.lab.experiments import montecarlo as mc
-    from bikeped.lab.experiments.recall_curve import load_recall_curve
+    from bikeped.lab.experiments import trials as mc
+    from bikeped.lab.simulation.perception import load_recall_curve
     from bikeped.lab.simulation.suite import CONFIGURATIONS
 
     curve = None if curve_path is None else load_recall_curve(curve_path)
@@ -168,9 +168,8 @@ def latency(
 ) -> None:
     """Effect of camera latency, 0 to 500 ms, with and without motion prediction."""
     from bikeped.lab.experiments import latency as sweeps
-    from bikeped.lab.experiments.recall_curve import load_recall_curve
     from bikeped.lab.experiments.trials import trial_jobs
-    from bikeped.lab.simulation.perception import recall_models
+    from bikeped.lab.simulation.perception import load_recall_curve, recall_models
 
     if not loss and (bursts or curve_path is not None):
         raise BikepedError("latency: --bursts and --recall-curve belong to --loss; add it")
@@ -287,8 +286,8 @@ def reproduce(
     require("scipy")  # before the work, not in the middle of it
     from bikeped.lab.experiments import reproduce as reproduction
     from bikeped.lab.experiments.deterministic import METRIC_COLUMNS
-    from bikeped.lab.experiments.recall_curve import load_recall_curve
     from bikeped.lab.result_tables import ResultTable, cells
+    from bikeped.lab.simulation.perception import load_recall_curve
 
     if not no_figures:
         require("matplotlib")

@@ -84,7 +84,7 @@ def command(
     observations = collect_observations(runs, suite.perception_results, loaded)
     result = end_to_end_result(suite, runs, steps, observations, drawing)
     if figures is not None:
-        from bikeped.lab.endtoend.figure import draw_pixels
+        from bikeped.lab.endtoend.report import draw_pixels
 
         draw_pixels(result.data, figures)
     run.emit(result)

@@ -46,7 +46,7 @@ def command(
 
     Uses the bundled detector where none is configured.
     """
-    from bikeped.lab.demo import bundled_scenario, format_summary, summarise
+    from bikeped.lab.demo.summary import bundled_scenario, format_summary, summarise
     from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera, sidecar_path
     from bikeped.lab.rendering.clip import frame_times, write_clip
     from bikeped.lab.scenarios.scenario import load_scenario

@@ -14,8 +14,8 @@ from bikeped.cli.guard import guarded
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
+from bikeped.lab.cli.conformance_governance import print_comparison
 from bikeped.lab.cli.conformance_shared import scenarios_option
-from bikeped.lab.cli.governance_tables import print_comparison
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
 
 if TYPE_CHECKING:

@@ -1,9 +1,10 @@
-"""Summary of a replayed demo from its event lines, as JSON and as text."""
+"""Summary of a replayed demo from its event lines, as JSON and as text; its scenario file."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from bikeped.decision.episodes import runs
@@ -13,6 +14,11 @@ MERGE_S = 1.0
 _STATES = ("IDLE", "SAFE", "WARNING", "ALERT")
 
 Event = Mapping[str, Any]
+
+
+def bundled_scenario() -> Path:
+    """The scenario file of the demo."""
+    return Path(__file__).with_name("crossing.yaml")
 
 
 def summarise(events: Sequence[Event], scenario: str = "") -> dict[str, Any]:

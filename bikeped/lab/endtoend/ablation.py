@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config import DecisionConfig, LoadedConfig
-from bikeped.lab.endtoend.matching import MIN_VISIBLE, match_detections
+from bikeped.lab.endtoend.measures import MIN_VISIBLE, match_detections
 from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.simulation.metrics import Metrics, measure

@@ -1,4 +1,4 @@
-"""Scenarios rendered and run through the deployed loop, each in a process of its own."""
+"""Scenarios rendered as JPEG frames and run through the deployed loop, one process each."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import simplejpeg
 
+from bikeped.capture.base import FrameSource
 from bikeped.config import LoadedConfig
 from bikeped.feedback.signal_logic import SignalLogic
-from bikeped.lab.endtoend.drawn_source import DrawnSource
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario
@@ -22,7 +23,7 @@ from bikeped.pipeline.feed import RecordedFeed
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.types import Detections
+from bikeped.types import Detections, Frame
 
 
 @dataclass(frozen=True)
@@ -105,3 +106,35 @@ def run_all(
     jobs = [(loaded, scenarios[i], conditions, size) for i in order]
     runs = run_jobs(run_scenario, jobs, processes, progress)
     return [run for _, run in sorted(zip(order, runs, strict=True), key=lambda pair: pair[0])]
+
+
+#: Roughly that of the pole's camera: its compression affects small figures.
+JPEG_QUALITY = 90
+
+
+class DrawnSource(FrameSource):
+    """Renders a frame at each read; `objects` holds the drawn objects of each, in order."""
+
+    def __init__(self, painter: ScenePainter, name: str, time_s: Sequence[float], fps: float):
+        self._painter = painter
+        self._time_s = tuple(time_s)
+        self.name = name
+        self.width, self.height = painter.camera.size
+        self.fps = fps
+        self.live = False
+        self.objects: list[tuple[DrawnObject, ...]] = []
+
+    def read(self) -> Frame | None:
+        number = len(self.objects)
+        if number >= len(self._time_s):
+            return None
+        t = self._time_s[number]
+        rgb, objects = self._painter.draw(t)
+        self.objects.append(tuple(objects))
+        jpeg: bytes = simplejpeg.encode_jpeg(
+            rgb, quality=JPEG_QUALITY, colorspace="RGB", colorsubsampling="420"
+        )
+        return Frame(number, t, self.width, self.height, jpeg=jpeg)
+
+    def close(self) -> None:
+        """Nothing to release."""

@@ -22,7 +22,7 @@ from bikeped import __version__
 from bikeped.config import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.files import make_folder, write_whole
-from bikeped.lab.experiments import deployment, latency, montecarlo, optimizer
+from bikeped.lab.experiments import deployment, latency, optimizer
 from bikeped.lab.experiments.deterministic import (
     braking_profiles,
     compare_table,
@@ -32,7 +32,7 @@ from bikeped.lab.experiments.deterministic import (
     truth_sensitivity,
     warning_budgets,
 )
-from bikeped.lab.experiments.trials import TRIALS
+from bikeped.lab.experiments.trials import BURST_FRAMES, TRIALS, montecarlo
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.simulation.perception import RecallCurve, RecallModel, recall_models
@@ -48,7 +48,7 @@ class ReproduceSettings:
 
     trials: int = TRIALS
     seed: int = 0
-    burst: float = montecarlo.BURST_FRAMES
+    burst: float = BURST_FRAMES
     curve: RecallCurve | None = None
     maxiter: int = optimizer.MAXITER
     popsize: int = optimizer.POPSIZE
@@ -64,7 +64,7 @@ class ReproduceSettings:
 Experiment = Callable[[Suite, LoadedConfig, ReproduceSettings], ExperimentResult]
 #: By name: the longest first, so that no core waits long at the end.
 EXPERIMENTS: dict[str, Experiment] = {
-    "montecarlo": lambda suite, _, s: montecarlo.montecarlo(
+    "montecarlo": lambda suite, _, s: montecarlo(
         suite, CONFIGURATIONS, s.trials, s.seed, s.burst, s.curve
     ),
     "optimize": lambda suite, loaded, s: optimizer.optimize(

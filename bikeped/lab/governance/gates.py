@@ -1,4 +1,4 @@
-"""The deployment gates (definitions, section 10; paper, section 4).
+"""The deployment gates (definitions, section 10; paper, section 4), and promotion of a decision.
 
 Provisional design targets, as the paper says: they reject configurations that fail by design, and
 say nothing about rain, darkness or real people.
@@ -6,12 +6,32 @@ say nothing about rain, darkness or real people.
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from bikeped import __version__
+from bikeped.config import DecisionConfig, LoadedConfig, config_hash, parse_config
+from bikeped.config.edit import replace_section
+from bikeped.config.provenance import (
+    DECIDING_CODE,
+    MEASURING_CODE,
+    code_hash,
+    decision_hash,
+    provenance_path,
+    setting_hashes,
+)
+from bikeped.config.strict_yaml import read_text
+from bikeped.errors import BikepedError, ConfigError
+from bikeped.files import write_like
 from bikeped.lab.simulation.metrics import Metrics, finite_or_none
+from bikeped.lab.simulation.suite import Suite, camera_json
 from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S
 
 SENSITIVITY_MIN = 0.90
@@ -93,3 +113,88 @@ def check_gate_figures(figures: Mapping[str, Any]) -> list[Gate]:
 def all_hold(gates: list[Gate]) -> bool:
     """Whether a configuration may be promoted."""
     return all(gate.holds for gate in gates)
+
+
+@dataclass(frozen=True)
+class Promoted:
+    """The files of a promotion."""
+
+    config: Path
+    backup: Path
+    provenance: Path
+
+
+def provenance_record(
+    suite: Suite,
+    decision: DecisionConfig,
+    metrics: Metrics,
+    loaded: LoadedConfig,
+    files: Sequence[tuple[str, Path]] = (),
+) -> dict[str, Any]:
+    """Everything that a promotion rests on: suite, settings, calibration, code, figures.
+
+    `files` are further files to name by their hash: `candidate`, `trace`.
+    """
+    after = replace(loaded, config=msgspec.structs.replace(loaded.config, decision=decision))
+    return {
+        "format": 1,
+        "promoted_at": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "decision": msgspec.to_builtins(decision),
+        **setting_hashes(after),
+        "decision_hash_before": decision_hash(loaded.config.decision),
+        "config_hash": config_hash(after.config, loaded.calibration_hash),
+        "calibration_hash": loaded.calibration_hash,
+        "camera": camera_json(suite),
+        "suite_hash": suite.hash,
+        "scenarios": len(suite.scenarios),
+        "scenario_names": list(suite.names),
+        "truth": {
+            key: getattr(suite.truth_settings, key)
+            for key in ("cpa_radius_m", "stopping_margin", "ttc_bound_s", "braking")
+        },
+        "version": __version__,
+        "code_hash": code_hash(DECIDING_CODE),
+        "measuring_code_hash": code_hash((*DECIDING_CODE, *MEASURING_CODE)),
+        "metrics": metrics.as_dict(),
+        "gates": [gate.as_dict() for gate in check_gates(metrics)],
+        "files": {role: {"name": path.name, "sha256": file_hash(path)} for role, path in files},
+    }
+
+
+def promote(
+    config_path: Path, loaded: LoadedConfig, decision: DecisionConfig, record: dict[str, Any]
+) -> Promoted:
+    """Replaces the decision section of `config_path`; the caller has seen that all gates hold.
+
+    The file before it stays as `<name>.bak`. Each file appears whole or not at all, config.yaml
+    last: whatever ends this early leaves a pole that says that section and provenance differ.
+    """
+    failed = [gate["name"] for gate in record["gates"] if not gate["holds"]]
+    if failed:
+        raise BikepedError(
+            f"{config_path}: not promoted, for gates do not hold: {', '.join(failed)}"
+        )
+    target = config_path.resolve()  # a link to the file stays a link
+    before = read_text(target, "give it with -c")
+    note = f"promoted {record['promoted_at'][:10]}, see {provenance_path(target).name}"
+    values = msgspec.to_builtins(decision)
+    after = replace_section(before, "decision", values, str(config_path), note)
+    wanted = msgspec.structs.replace(loaded.config, decision=decision)
+    if parse_config(after, str(config_path), config_path.parent).config != wanted:
+        raise ConfigError(
+            f"{config_path}: the file changed while the gates were checked, so nothing was "
+            "written; promote again"
+        )
+    files = Promoted(target, target.with_name(target.name + ".bak"), provenance_path(target))
+    write_like(files.backup, before.encode(), target)
+    write_like(files.provenance, msgspec.json.format(msgspec.json.encode(record)) + b"\n", target)
+    write_like(files.config, after.encode(), target)
+    return files
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file; BikepedError names it when it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise BikepedError(f"{path}: cannot be read ({error.strerror}); check the path") from error

@@ -11,7 +11,7 @@ from coco_sets import annotation, write_set
 from onnx import TensorProto, helper, numpy_helper
 
 from bikeped.cli.main import main
-from bikeped.lab.experiments.recall_curve import load_recall_curve
+from bikeped.lab.simulation.perception import load_recall_curve
 
 CPU = ("--set", "detection.providers=[cpu]")
 

@@ -5,7 +5,7 @@ import pytest
 from drawn_detectors import boxes
 
 from bikeped.config import load_config
-from bikeped.lab.demo import bundled_scenario, format_summary, summarise
+from bikeped.lab.demo.summary import bundled_scenario, format_summary, summarise
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import load_scenario
 from bikeped.pipeline.track_and_decide import TrackAndDecide

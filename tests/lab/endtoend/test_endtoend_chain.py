@@ -10,8 +10,12 @@ from drawn_detectors import OracleDetector
 
 from bikeped.config import LoadedConfig, load_config
 from bikeped.lab.endtoend.ablation import run_ablation, states_from_boxes
-from bikeped.lab.endtoend.matching import MIN_VISIBLE
-from bikeped.lab.endtoend.measures import collect_observations, localisation_rows, recall_rows
+from bikeped.lab.endtoend.measures import (
+    MIN_VISIBLE,
+    collect_observations,
+    localisation_rows,
+    recall_rows,
+)
 from bikeped.lab.endtoend.report import DrawingSettings, end_to_end_result, verdict
 from bikeped.lab.endtoend.run import EndToEndRun, run_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera

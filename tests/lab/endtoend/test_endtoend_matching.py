@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from endtoend_fakes import drawn, found
 
-from bikeped.lab.endtoend.matching import match_detections
+from bikeped.lab.endtoend.measures import match_detections
 from bikeped.types import Detections, Kind
 
 WALKER, RIDER = Kind.PEDESTRIAN, Kind.CYCLIST

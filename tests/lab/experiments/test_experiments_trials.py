@@ -13,8 +13,8 @@ from detection_losses import misses
 
 from bikeped.config import load_config, rule_settings
 from bikeped.errors import BikepedError
-from bikeped.lab.experiments import montecarlo as mc
 from bikeped.lab.experiments import trials
+from bikeped.lab.experiments import trials as mc
 from bikeped.lab.experiments.latency import (
     DELAYS_MS,
     PREDICTORS,
@@ -22,10 +22,9 @@ from bikeped.lab.experiments.latency import (
     sweep,
     sweep_with_loss,
 )
-from bikeped.lab.experiments.recall_curve import load_recall_curve
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.metrics import measure
-from bikeped.lab.simulation.perception import RecallModel, trial_generator
+from bikeped.lab.simulation.perception import RecallModel, load_recall_curve, trial_generator
 from bikeped.lab.simulation.simulate import (
     DetectionSequence,
     build_rule_input,

@@ -12,7 +12,7 @@ from bikeped.config import DecisionConfig, load_config, parse_decision
 from bikeped.config.provenance import check_provenance, decision_hash
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.lab.cli.conformance import command as conformance
-from bikeped.lab.governance import promote as promoting
+from bikeped.lab.governance import gates as promoting
 from bikeped.lab.governance.gates import all_hold, check_gate_figures, check_gates
 from bikeped.lab.scenarios.scenario import load_scenarios
 from bikeped.lab.simulation.suite import Suite

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import BikepedError, DataSetError
-from bikeped.lab.experiments.recall_curve import load_recall_curve
-from bikeped.lab.simulation.perception import RecallModel
+from bikeped.lab.simulation.perception import RecallModel, load_recall_curve
 from bikeped.lab.training.evaluate import write_curve
 from bikeped.lab.training.measures import (
     DetectionSet,
