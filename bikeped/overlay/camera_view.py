@@ -78,9 +78,8 @@ def draw_banner(image: ImageArray, data: OverlayData, rect: Rect) -> None:
             # The light holds ALERT for a while: show the rule's present state too.
             note = f"rule now: {rule}"
             room = text_size(note, small)[0] + pad
-            draw_text(
-                image, note, (x1 - pad, y0 + (tall - small) / 2), small, PAPER, anchor="right"
-            )
+            at = (x1 - pad, y0 + (tall - small) / 2)
+            draw_text(image, note, at, small, PAPER, anchor="right")
             x1 -= room
     lines = wrap_text(_reason(data), small, x1 - pad - left, 2)
     step = small * 1.7
@@ -131,7 +130,7 @@ class _CameraView:
         w, h = self.w, self.h
         top = _banner_height(w, h) if banner else 0
         self.bounds: Rect = (2, top + 2, w - 2, h - 2)
-        footer = self._footer()
+        footer_text, footer_rect = self._footer()
         line = self._pair_line()
         if line is not None:
             wide = max(round(self.size / 5), 2)
@@ -144,9 +143,9 @@ class _CameraView:
         avoid = [box for _, box, _ in shown]
         for text, box, colour in shown:
             self._draw_label(text, box, colour, avoid)
-        footer_text, rect = footer
-        fill_rect(self.image, rect, INK, 0.72)
-        draw_text(self.image, footer_text, (self.size, rect[1] + 0.6 * self.size), self.size, PAPER)
+        fill_rect(self.image, footer_rect, INK, 0.72)
+        at = (self.size, footer_rect[1] + 0.6 * self.size)
+        draw_text(self.image, footer_text, at, self.size, PAPER)
         if banner:
             draw_banner(self.image, self.data, (0, 0, w, top))
         return self.image
@@ -159,18 +158,16 @@ class _CameraView:
         line = self.line_px
         entries: list[tuple[bool, str, Rect, Rgb]] = []
         for d in np.argsort(-area, kind="stable").tolist():
-            x0, y0, x1, y1 = self.boxes[d].tolist()
-            box: Rect = (x0, y0, x1, y1)
+            x0, y0, x1, y1 = box = tuple(self.boxes[d].tolist())
             row = row_of.get(d)
             kind = Kind(int(self.data.detections.kind[d]))
             colour = KIND_COLOUR[kind]
             paired = row is not None and self.rows is not None and row in self.rows
             if paired and self.data.alerting:
                 halo = line * 2 + 1
-                wide: Rect = (x0 - halo, y0 - halo, x1 + halo, y1 + halo)
-                outline(self.image, wide, PAPER, line + 3)
-                outline(self.image, wide, SIGNAL_COLOUR["ALERT"], line + 1)
-                box = wide
+                box = (x0 - halo, y0 - halo, x1 + halo, y1 + halo)
+                outline(self.image, box, PAPER, line + 3)
+                outline(self.image, box, SIGNAL_COLOUR["ALERT"], line + 1)
             outline(self.image, (x0, y0, x1, y1), INK, line + 2)
             outline(self.image, (x0, y0, x1, y1), colour, line)
             if row is None:
@@ -246,13 +243,8 @@ class _CameraView:
         self.taken.append(spot)
         fill_rect(self.image, (spot[0] - 1, spot[1] - 1, spot[2] + 1, spot[3] + 1), INK)
         fill_rect(self.image, spot, colour)
-        draw_text(
-            self.image,
-            text,
-            (spot[0] + self.size / 2, spot[1] + (h - self.size) / 2),
-            self.size,
-            readable_on(colour),
-        )
+        at = (spot[0] + self.size / 2, spot[1] + (h - self.size) / 2)
+        draw_text(self.image, text, at, self.size, readable_on(colour))
 
     def _footer(self) -> tuple[str, Rect]:
         """The footer's text and its place at the lower left edge, which is taken."""

@@ -39,11 +39,8 @@ _FAR = 1e5  # beyond this a coordinate overflows OpenCV's fixed-point arithmetic
 
 
 def shade(colour: Rgb, factor: float) -> Rgb:
-    """The colour darkened (factor below 1) or mixed with white (above 1, up to 2)."""
-    if factor <= 1:
-        r, g, b = (int(c * factor) for c in colour)
-    else:
-        r, g, b = (int(c + (255 - c) * (factor - 1)) for c in colour)
+    """The colour darkened by `factor`, 0 to 1."""
+    r, g, b = (int(c * factor) for c in colour)
     return r, g, b
 
 
@@ -117,28 +114,19 @@ def fill_rect(image: ImageArray, rect: Rect, colour: Rgb, opacity: float = 1.0) 
     part = image[_clipped(image, rect)]
     if part.size == 0:
         return
-    if opacity >= 1:
-        part[:] = colour
-        return
-    flat = np.empty_like(part)
-    flat[:] = colour
-    cv2.addWeighted(flat, opacity, part, 1 - opacity, 0, dst=part)
+    cv2.addWeighted(np.full_like(part, colour), opacity, part, 1 - opacity, 0, dst=part)
 
 
 def outline(image: ImageArray, rect: Rect, colour: Rgb, thickness: int) -> None:
     """A rectangle's outline."""
-    a = _fixed(np.array([[rect[0], rect[1]]]))[0]
-    b = _fixed(np.array([[rect[2], rect[3]]]))[0]
-    cv2.rectangle(image, a.tolist(), b.tolist(), colour, thickness, cv2.LINE_AA, _SHIFT)
+    a, b = _fixed(np.reshape(rect, (2, 2))).tolist()
+    cv2.rectangle(image, a, b, colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
-def polyline(
-    image: ImageArray, points: FloatArray, colour: Rgb, thickness: int, *, closed: bool = False
-) -> None:
+def polyline(image: ImageArray, points: FloatArray, colour: Rgb, thickness: int) -> None:
     """An anti-aliased line through `points` [n, 2]; NaN points break it."""
     for part in _unbroken(points):
-        whole = closed and len(part) == len(points)
-        cv2.polylines(image, [_fixed(part)], whole, colour, thickness, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(image, [_fixed(part)], False, colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
 def dashed(

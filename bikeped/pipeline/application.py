@@ -33,8 +33,8 @@ from bikeped.pipeline.loop import FrameResultListener, Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher, SignalListener
 from bikeped.pipeline.telemetry import Telemetry, report_health
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import rfc3339
+from bikeped.telemetry.event_files import AuditLog
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.mqtt import MqttPublisher, MqttStatus

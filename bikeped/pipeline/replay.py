@@ -26,7 +26,7 @@ from bikeped.pipeline.feed import RecordedFeed
 from bikeped.pipeline.loop import FrameResult, FrameResultListener, frame_overlay
 from bikeped.pipeline.telemetry import event_line_for
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
-from bikeped.telemetry.events import EventWriter
+from bikeped.telemetry.event_files import EventWriter
 from bikeped.telemetry.latency import StageTimes
 from bikeped.types import Kind, State
 
@@ -240,7 +240,8 @@ async def _replay(
         if files.events is not None:
             events = EventFile(files.events, new_event_header(loaded, detector))
             stack.callback(events.partial_path.unlink, missing_ok=True)  # no rest after an error
-            outputs.append(stack.enter_context(events))
+            stack.enter_context(events)
+            outputs.append(events)
         if files.overlay is not None:
             fps = source.fps if source.fps > 0 else 30.0
             writer = stack.enter_context(VideoWriter(files.overlay, fps, OVERLAY_SIZE))

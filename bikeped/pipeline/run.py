@@ -28,7 +28,7 @@ from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.runtime import Notifier, WorkerThread
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
-from bikeped.telemetry.audit import AuditLog
+from bikeped.telemetry.event_files import AuditLog
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,6 @@ from bikeped.feedback.light import LightDriver
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import (
     encode,
     event_line,
@@ -26,6 +25,7 @@ from bikeped.telemetry.builders import (
     state_message,
     tracks_message,
 )
+from bikeped.telemetry.event_files import AuditLog
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.mqtt import MqttPublisher

@@ -76,8 +76,8 @@ def tracks_message(
     name gets none. Tracks without finite numbers are left out.
     """
     tracks = finite_tracks(tracks)
-    distance_m = _rounded(np.hypot(tracks.xy_m[:, 0], tracks.xy_m[:, 1]), 3)
-    speed_mps = _rounded(np.hypot(tracks.velocity_mps[:, 0], tracks.velocity_mps[:, 1]), 3)
+    distance_m = _rounded(np.hypot(*tracks.xy_m.T), 3)
+    speed_mps = _rounded(np.hypot(*tracks.velocity_mps.T), 3)
     objects = [
         TrackedObject(
             track_id=track.id,

@@ -65,13 +65,8 @@ class StageTimes:
             values = self.values_ms(stage)
             if len(values):
                 p50, p95, p99 = np.percentile(values, (50, 95, 99)).tolist()
-                rows[stage] = {
-                    "p50": p50,
-                    "p95": p95,
-                    "p99": p99,
-                    "max": float(values.max()),
-                    "mean": float(values.mean()),
-                }
+                rows[stage] = {"p50": p50, "p95": p95, "p99": p99}
+                rows[stage] |= {"max": float(values.max()), "mean": float(values.mean())}
         return rows
 
     def table(self) -> str:

@@ -34,6 +34,8 @@ _SEND_BUFFER = 128 * 1024
 _BOUNDARY = "bikeped-picture-4c1d9f"
 #: Between two pictures; Chromium shows one when it has read the headers of the next.
 _EDGE = f"\r\n--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n\r\n".encode()
+#: Closing the page is the usual end of a stream; it is not logged.
+_USUAL_END = contextlib.suppress(ConnectionError)
 
 
 class LivePage:
@@ -49,15 +51,15 @@ class LivePage:
         self._status: tuple[float, bytes] = (-1.0, b"")
         self._now: tuple[tuple[int, int], bytes] = ((-1, -1), b"")
 
-    def close(self) -> None:
+    async def close(self, _app: web.Application) -> None:
         """Ends all streams."""
         self._state.close()
-        self.renderer.close()
+        self.renderer.wake()
 
     async def events(self, request: web.Request) -> web.StreamResponse:
         """Server-sent events: `hello` once, `now` up to ten a second, `status` every second,
         `alerts` when they change."""
-        with self._counted("_pages"), _suppress_disconnect():
+        with self._counted("_pages"), _USUAL_END:
             response = web.StreamResponse(
                 headers={hdrs.CONTENT_TYPE: "text/event-stream", "X-Accel-Buffering": "no"}
             )
@@ -92,7 +94,7 @@ class LivePage:
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """The picture with boxes, tracks and the pair, as Motion JPEG."""
-        with self._counted("_streams"), self.renderer.viewer(), _suppress_disconnect():
+        with self._counted("_streams"), self.renderer.viewer(), _USUAL_END:
             response = web.StreamResponse(
                 headers={hdrs.CONTENT_TYPE: f"multipart/x-mixed-replace; boundary={_BOUNDARY}"}
             )
@@ -122,24 +124,20 @@ class LivePage:
 
     def _hello(self) -> dict[str, Any]:
         """Data that stay the same while the service runs."""
-        loaded, lens = (
-            self._web_context.loaded,
-            self._web_context.track_and_decide.ground_mapper.camera.lens,
-        )
+        context, loaded = self._web_context, self._web_context.loaded
         config = loaded.config
+        camera = context.track_and_decide.ground_mapper.camera
         return {
             "stages": STAGES,
             "config_hash": loaded.hash,
             "calibration_hash": loaded.calibration_hash,
-            "source": display_source(self._web_context.source),
-            "detector": self._web_context.detector,
+            "source": display_source(context.source),
+            "detector": context.detector,
             "light": config.feedback.light,
             "rule": config.decision.rule,
-            "broker": None
-            if self._web_context.mqtt is None
-            else f"{config.mqtt.host}:{config.mqtt.port}",
-            "fov_rad": 2 * lens.max_theta_rad,
-            "heading_deg": self._web_context.track_and_decide.ground_mapper.camera.heading_deg,
+            "broker": context.mqtt and f"{config.mqtt.host}:{config.mqtt.port}",
+            "fov_rad": 2 * camera.lens.max_theta_rad,
+            "heading_deg": camera.heading_deg,
             "range_m": config.tracking.max_range_m,
         }
 
@@ -175,18 +173,7 @@ def add_live(app: web.Application, live: LivePage) -> None:
     app.router.add_get("/live/events", live.events, allow_head=False)
     app.router.add_get("/live/stream", live.stream, allow_head=False)
     app.router.add_get("/live/room", live.capacity)
-
-    async def close(_app: web.Application) -> None:
-        live.close()
-
-    app.on_shutdown.append(close)
-
-
-@contextlib.contextmanager
-def _suppress_disconnect() -> Iterator[None]:
-    """Closing the page is the usual end of a stream; it is not logged."""
-    with contextlib.suppress(ConnectionError):
-        yield
+    app.on_shutdown.append(live.close)
 
 
 def _event(name: str, data: bytes) -> bytes:

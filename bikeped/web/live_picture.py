@@ -71,11 +71,8 @@ class PictureRenderer:
             await self._fresh.wait()
         return None
 
-    def close(self) -> None:
-        """Ends all waiting; call after the state was closed."""
-        self._notify()
-
-    def _notify(self) -> None:
+    def wake(self) -> None:
+        """Wakes all that wait; without a new picture, call it after the state was closed."""
         self._fresh.set()
         self._fresh = asyncio.Event()
 
@@ -99,7 +96,7 @@ class PictureRenderer:
                     self._limited_log.failure("picture", error)
                 else:
                     self.number += 1
-                    self._notify()
+                    self.wake()
                 rest_s = self._interval_s - (time.monotonic() - began_s)
                 await asyncio.sleep(max(rest_s, 0.0))
         finally:

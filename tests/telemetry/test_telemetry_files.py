@@ -15,9 +15,8 @@ import pytest
 
 from bikeped.config.schema import AuditConfig
 from bikeped.errors import TelemetryError
-from bikeped.telemetry.audit import AuditLog
 from bikeped.telemetry.builders import event_line, rfc3339
-from bikeped.telemetry.events import EventWriter
+from bikeped.telemetry.event_files import AuditLog, EventWriter
 from bikeped.telemetry.schema import EventHeader, EventLine
 from bikeped.types import Decision, Detections, State, Tracks
 

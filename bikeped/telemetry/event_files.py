@@ -1,8 +1,4 @@
-"""The audit log: event lines appended and rotated by a thread of its own.
-
-`write` only queues a line. While the thread cannot write (disk full or read-only, directory gone)
-it sets `fault` and tries again; meanwhile the queue keeps the newest lines and counts the rest.
-"""
+"""Event lines on disk: the file that `--events` writes, and the rotating audit log."""
 
 from __future__ import annotations
 
@@ -17,6 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from bikeped.config.schema import AuditConfig
+from bikeped.errors import TelemetryError
 from bikeped.faults import Fault
 from bikeped.telemetry.builders import encode_line
 from bikeped.telemetry.schema import EventHeader, EventLine
@@ -26,8 +23,69 @@ log = logging.getLogger(__name__)
 MB = 1_000_000  #: bytes
 
 
+class EventWriter:
+    """Writes the header and then one line a frame to `<name>.partial`; `close` renames it.
+
+    A file of the final name is always complete. As a context manager it closes after success and
+    leaves the partial file after an exception. Raises TelemetryError when it cannot write.
+    """
+
+    def __init__(self, path: Path | str, header: EventHeader) -> None:
+        self.path = Path(path)
+        self.partial_path = self.path.with_name(self.path.name + ".partial")
+        try:
+            self._file = self.partial_path.open("wb")
+        except OSError as exc:
+            raise self._error(exc) from exc
+        self.write(header)
+
+    def write(self, line: EventHeader | EventLine) -> None:
+        """Appends one line."""
+        try:
+            self._file.write(encode_line(line))
+        except OSError as exc:
+            raise self._error(exc) from exc
+
+    def close(self) -> None:
+        """Completes the file and renames it; again is harmless."""
+        if self._file.closed:
+            return
+        try:
+            with self._file:
+                self._file.flush()
+                os.fsync(self._file.fileno())
+            self.partial_path.replace(self.path)
+        except OSError as exc:
+            raise self._error(exc) from exc
+
+    def abandon(self) -> None:
+        """Closes the file and leaves it under its partial name."""
+        try:
+            self._file.close()
+        except OSError as exc:
+            raise self._error(exc) from exc
+
+    def __enter__(self) -> EventWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abandon()
+
+    def _error(self, exc: OSError) -> TelemetryError:
+        return TelemetryError(
+            f"{self.partial_path}: the events cannot be written ({exc.strerror}): "
+            "give --events a file in a directory that has room and that you may write"
+        )
+
+
 class AuditLog:
     """Appends event lines to `config.path`; does nothing without a path. No method raises OSError.
+
+    `write` only queues a line; a thread writes. While it cannot (disk full or read-only, directory
+    gone) it sets `fault` and tries again; the queue keeps the newest lines and counts the rest.
 
     `header` is written whenever a file is opened. At `max_mb` the file becomes `<name>.1`, the
     former `.1` becomes `.2`, and so on up to `keep`. `queue_size` bounds the lines that wait,
@@ -58,31 +116,16 @@ class AuditLog:
 
         self._changed = threading.Condition()  # guards the fields down to `_closing`
         self._queue: deque[bytes] = deque()
-        self._dropped = 0
-        self._written = 0
+        self.dropped = 0  #: lines lost since the start
+        self.written = 0  #: lines written since the start, without headers
         self._closing = False
-        self._fault: Fault | None = None
+        self.fault: Fault | None = None  #: why nothing can be written; None while it can
         self._thread: threading.Thread | None = None
 
         # Only the thread touches these.
         self._file: BinaryIO | None = None
         self._size = 0
         self._synced_s = 0.0
-
-    @property
-    def fault(self) -> Fault | None:
-        """Why nothing can be written, with the remedy; None while it can."""
-        return self._fault
-
-    @property
-    def dropped(self) -> int:
-        """Lines lost since the start."""
-        return self._dropped
-
-    @property
-    def written(self) -> int:
-        """Lines written since the start, without headers."""
-        return self._written
 
     def start(self) -> None:
         """Starts the thread: a daemon, so that a hung disk cannot keep the process alive."""
@@ -98,7 +141,7 @@ class AuditLog:
         with self._changed:
             if len(self._queue) >= self._queue_size:
                 self._queue.popleft()
-                self._dropped += 1
+                self.dropped += 1
             self._queue.append(data)
             self._changed.notify()
 
@@ -121,7 +164,7 @@ class AuditLog:
                 closing = self._closing
             written, error = self._append(lines, sync=closing)
             with self._changed:
-                self._written += written
+                self.written += written
                 self._requeue(lines[written:], lost=closing)
                 self._log_fault_change(error)
                 if closing:
@@ -134,17 +177,17 @@ class AuditLog:
         """Puts unwritten lines back before newer ones, as far as there is room."""
         room = 0 if lost else max(0, self._queue_size - len(self._queue))
         kept = lines[max(0, len(lines) - room) :] if room else []
-        self._dropped += len(lines) - len(kept)
+        self.dropped += len(lines) - len(kept)
         self._queue.extendleft(reversed(kept))
 
     def _log_fault_change(self, error: str | None) -> None:
         fault = None if error is None else Fault("audit", "audit.error", error)
-        if fault != self._fault:
+        if fault != self.fault:
             if fault is None:
                 log.info("audit: writing again")
             else:
                 log.error("%s", fault)
-        self._fault = fault
+        self.fault = fault
 
     def _append(self, lines: list[bytes], *, sync: bool) -> tuple[int, str | None]:
         """Writes `lines`; returns how many were written, and the error that stopped the rest."""
