@@ -65,8 +65,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 def write_whole(path: Path, content: str | bytes) -> None:
     """Writes text (as UTF-8) or bytes under a temporary name and renames it.
 
-    A pipe or a device is written to as it is: a rename would put a file in its place. Raises
-    BikepedError, naming the file and the remedy, when it cannot.
+    A pipe or a device is written to as it is: a rename would replace it. Raises BikepedError.
     """
     data = content.encode("utf-8") if isinstance(content, str) else content
     with _named(path, "written", "choose a folder that exists and that you may write"):

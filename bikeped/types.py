@@ -170,20 +170,12 @@ class Tracks:
 
     def take(self, index: npt.NDArray[Any]) -> Tracks:
         """The tracks at `index` (integers or a mask), in that order."""
-        return Tracks(
-            self.time_s,
-            self.id[index],
-            self.kind[index],
-            self.xy_m[index],
-            self.velocity_mps[index],
-            self.unseen_s[index],
-            self.detection[index],
-        )
+        _, *arrays = vars(self).values()
+        return Tracks(self.time_s, *(array[index] for array in arrays))
 
     @staticmethod
     def empty(time_s: float) -> Tracks:
-        none = np.zeros(0, np.int64)
-        flat = np.zeros((0, 2))
+        none, flat = np.zeros(0, np.int64), np.zeros((0, 2))
         return Tracks(time_s, none, np.zeros(0, np.int8), flat, flat, np.zeros(0), none)
 
 

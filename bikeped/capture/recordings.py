@@ -41,13 +41,12 @@ class ImageSource(FrameSource):
     live = False
 
     def __init__(self, path: Path | str, *, fps: float) -> None:
-        folder = Path(path)
         self.name = str(path)
         if not usable_fps(fps):
             raise CaptureError(f"camera.fps: {fps} frames per second is not possible; try 30")
         self.fps = fps
         try:
-            self._paths = image_paths(folder)
+            self._paths = image_paths(Path(path))
         except OSError as error:
             raise CaptureError(f"{self.name}: cannot be read: {error.strerror}") from error
         if not self._paths:
@@ -83,12 +82,8 @@ def image_paths(path: Path) -> list[Path]:
     """The images of a folder in natural order; for a file, the file."""
     if not path.is_dir():
         return [path]
-    found = [
-        entry
-        for entry in path.iterdir()
-        if entry.suffix.lower() in IMAGE_SUFFIXES and entry.is_file()
-    ]
-    return sorted(found, key=lambda entry: natural_key(entry.name))
+    found = (file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(filter(Path.is_file, found), key=lambda file: natural_key(file.name))
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:

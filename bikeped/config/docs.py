@@ -104,9 +104,8 @@ def _values(item: dict[str, Any]) -> str:
     kind = item["type"]
     if kind == "array":
         return f"list of {_values(item['items'])}"
-    words = {"boolean": "`true` or `false`", "string": "text", "null": "`null`"}
-    if kind in words:
-        return words[kind]
+    if word := {"boolean": "`true` or `false`", "string": "text", "null": "`null`"}.get(kind):
+        return word
     name = "whole number" if kind == "integer" else "number"
     high = item["maximum"]
     if "exclusiveMinimum" in item:

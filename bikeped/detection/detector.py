@@ -54,7 +54,6 @@ class Backend(Protocol):
     @property
     def description(self) -> str:
         """The runtime, for messages."""
-        ...
 
     @property
     def metadata(self) -> ModelMetadata: ...
@@ -62,19 +61,16 @@ class Backend(Protocol):
     @property
     def region(self) -> Region | None:
         """The part of every frame that the network sees; None: all."""
-        ...
 
     @property
     def buffer(self) -> npt.NDArray[Any]:
         """The network's input [1, 3, height, width], to be filled before `run`."""
-        ...
 
     def run(self) -> list[tuple[str, npt.NDArray[Any]]]:
         """All outputs for the input in `buffer`, with their names.
 
         The arrays may be overwritten by the next call.
         """
-        ...
 
 
 class NetworkDetector:

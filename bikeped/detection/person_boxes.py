@@ -17,12 +17,10 @@ the ground it would be a second pedestrian, metres behind the first, that closes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from bikeped.detection.nms import box_area, intersection_area
-from bikeped.types import BoolArray, Detections, Float32Array, FloatArray, Kind
+from bikeped.types import BoolArray, Detections, Float32Array, Kind
 
 # At least this share of the half lies within the whole; it
 _WITHIN = 0.85
@@ -84,15 +82,6 @@ _MIN_SAME_RIDER = 0.8
 _MIN_PART_WITHIN, _MAX_PART_SIZE = 0.6, 0.5
 
 
-@dataclass(frozen=True)
-class _Match:
-    """How well each person [n] fits each cycle [m], as a rider."""
-
-    cover: FloatArray  #: share of the person from the waist down that the cycle's box covers
-    offset: FloatArray  #: of the middles, as a share of the cycle's width
-    fits: BoolArray  #: covered enough, and placed and sized as a rider is
-
-
 def join_riders(found: Detections, overlap: float, confidence: float) -> Detections:
     """The detections with every rider and cycle joined to one cyclist, most confident first.
 
@@ -105,8 +94,7 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
     box, score = found.box_px.copy(), found.confidence.copy()
     dropped = (found.kind == Kind.CYCLIST) & (score < confidence)
     if overlap < 1 and len(person) and len(cycle):
-        match = _match(found.box_px[person], found.box_px[cycle], overlap)
-        pairs = _pairs(match)
+        pairs, fits = _pairs(found.box_px[person], found.box_px[cycle], overlap)
         ridden = np.zeros(len(found), np.bool_)
         ridden[cycle[[j for _, j in pairs]]] = True
         riding = np.zeros(len(found), np.bool_)
@@ -123,7 +111,7 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
             shared = intersection_area(found.box_px[person], found.box_px[rider])
             area = box_area(found.box_px[person])
             least = np.minimum(area, area[i])
-            dropped[person[match.fits[:, j] & (shared >= _MIN_SAME_RIDER * least)]] = True
+            dropped[person[fits[:, j] & (shared >= _MIN_SAME_RIDER * least)]] = True
             shared = intersection_area(found.box_px[cycle], box[own])
             area = box_area(found.box_px[cycle])
             part = (shared >= _MIN_PART_WITHIN * area) & (
@@ -135,24 +123,18 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
     return Detections(found.kind[order], score[order], box[order])
 
 
-def _pairs(match: _Match) -> list[tuple[int, int]]:
-    """Rider and cycle, each used once: best cover first, then the smaller offset."""
-    i, j = np.nonzero(match.fits)
-    # Rounded: covers that differ in the last digit only are equal.
-    order = np.lexsort((j, i, match.offset[i, j], -np.round(match.cover[i, j], 2)))
-    pairs: list[tuple[int, int]] = []
-    for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True):
-        if all(a != rider and b != cycle for rider, cycle in pairs):
-            pairs.append((a, b))
-    return pairs
-
-
-def _match(person: Float32Array, cycle: Float32Array, overlap: float) -> _Match:
+def _pairs(
+    person: Float32Array, cycle: Float32Array, overlap: float
+) -> tuple[list[tuple[int, int]], BoolArray]:
+    """Rider and cycle of boxes [n, 4] and [m, 4], each used once: best cover first, then the
+    smaller offset; and which persons could ride which cycles [n, m]."""
     p, c = person.astype(np.float64)[:, None, :], cycle.astype(np.float64)[None, :, :]
     legs = p.copy()  # from the waist down
     legs[..., 1] = (p[..., 1] + p[..., 3]) / 2
+    # The share of the person from the waist down that the cycle's box covers.
     cover = intersection_area(legs, c) / np.maximum(box_area(legs), 1e-9)
     tall = np.maximum(c[..., 3] - c[..., 1], 1e-9)
+    # Between the middles, as a share of the cycle's width.
     middle = (p[..., 0] + p[..., 2]) / 2
     offset = np.abs(middle - (c[..., 0] + c[..., 2]) / 2) / np.maximum(c[..., 2] - c[..., 0], 1e-9)
     feet = (p[..., 3] - c[..., 3]) / tall  # below the wheel line is positive
@@ -161,4 +143,11 @@ def _match(person: Float32Array, cycle: Float32Array, overlap: float) -> _Match:
     stands = (feet >= -_MAX_FEET_ABOVE) | ((feet >= -_MAX_CUT_ABOVE) & (span <= _MAX_CUT_SPAN))
     fits = stands & (feet <= _MAX_FEET_BELOW) & (offset <= 0.5) & (cover >= overlap) & (cover > 0)
     fits &= (ratio >= _MIN_RATIO) & (ratio <= _MAX_RATIO)
-    return _Match(cover, offset, fits)
+    i, j = np.nonzero(fits)
+    # Rounded: covers that differ in the last digit only are equal.
+    order = np.lexsort((j, i, offset[i, j], -np.round(cover[i, j], 2)))
+    pairs: list[tuple[int, int]] = []
+    for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True):
+        if all(a != rider and b != ridden for rider, ridden in pairs):
+            pairs.append((a, b))
+    return pairs, fits

@@ -114,14 +114,9 @@ class Cuda:
         self._device, self._host, self._stream = [], [], None
 
     def _copy(self, to: int, origin: int, size: int, kind: int) -> None:
-        self._call(
-            "cudaMemcpyAsync",
-            ctypes.c_void_p(to),
-            ctypes.c_void_p(origin),
-            ctypes.c_size_t(size),
-            ctypes.c_int(kind),
-            self._stream,
-        )
+        addresses = ctypes.c_void_p(to), ctypes.c_void_p(origin)
+        how = ctypes.c_size_t(size), ctypes.c_int(kind), self._stream
+        self._call("cudaMemcpyAsync", *addresses, *how)
 
     def _call(self, function: str, *arguments: Any) -> None:
         status = int(getattr(self._library, function)(*arguments))
