@@ -1,6 +1,7 @@
-"""The board's pattern, and where its corners were detected in each image.
+"""The board's pattern, where its corners were detected in each image, and why an image is refused.
 
 Pixels have their origin in the middle of the top left pixel (OpenCV's convention), u right, v down.
+Texts of refusals are for the person who took the image: what is wrong with it, and what to do.
 """
 
 from __future__ import annotations
@@ -78,3 +79,43 @@ class DetectedBoards:
     refused: Sequence[RefusedImage]
     images: int  #: of the set, refused ones included
     images_hash: str  #: SHA-256 over the images' bytes, in order of name
+
+
+#: Corners of an outer row or column that identify it: one or two could be something else.
+LEAST_IN_LINE = 3
+
+
+class BoardRefusedError(Exception):
+    """No usable board in an image, and why; empty where nothing in it looks like one."""
+
+
+def too_few_corners(count: int, pattern: BoardPattern, least: int | None = None) -> str:
+    """Only `count` corners of a board are clear."""
+    wanted = "" if least is None else f", not {least}"
+    return f"only {count} of {pattern.count} corners can be seen clearly{wanted}"
+
+
+def larger_board(pattern: BoardPattern, size: IntArray | None = None) -> str:
+    """The board has more corners than the pattern; `size` [2]: columns and rows seen."""
+    known = "" if size is None else f" (at least {max(size)}x{min(size)})"
+    return f"the board has more inner corners than {pattern}{known}; correct --pattern"
+
+
+def ambiguous_place(pattern: BoardPattern, size: IntArray) -> str:
+    """A grid of `size` [2] columns and rows fits several places of the board."""
+    wanted = (pattern.columns, pattern.rows)
+    columns, rows = int(size[0]), int(size[1])
+    too_large = columns > wanted[0] or rows > wanted[1]
+    other_shape = (columns != rows) != (wanted[0] != wanted[1])
+    if (too_large or other_shape) and rows <= wanted[0] and columns <= wanted[1]:
+        columns, rows = rows, columns
+    parts = [
+        f"{have} of {all_} {what}"
+        for have, all_, what in zip((columns, rows), wanted, ("columns", "rows"), strict=True)
+        if have < all_
+    ]
+    return (
+        f"{' and '.join(parts)} of the {pattern} board are in sight: which ones cannot be known; "
+        f"show the whole width and height ({LEAST_IN_LINE} corners of each outer row and column "
+        "at least), others may be hidden"
+    )

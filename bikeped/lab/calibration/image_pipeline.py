@@ -15,12 +15,16 @@ import numpy as np
 from bikeped.cores import cores
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing
-from bikeped.lab.calibration import refusals
-from bikeped.lab.calibration.board_view import BoardPattern, BoardView, DetectedBoards, RefusedImage
+from bikeped.lab.calibration.board_view import (
+    BoardPattern,
+    BoardRefusedError,
+    BoardView,
+    DetectedBoards,
+    RefusedImage,
+)
 from bikeped.lab.calibration.capture.images import CalibrationImage, check_image_sizes, images_hash
 from bikeped.lab.calibration.corners.board_check import DetectedBoard, rms_shift_px
 from bikeped.lab.calibration.corners.board_detector import check_pattern, detect_board
-from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.lab.calibration.solver.observations import FEWEST_CORNERS
 
 _SAME_PX = 0.5  # corners this close in two images: one and the same
@@ -56,10 +60,10 @@ def detect_boards(
         try:
             first = first_with[image.digest]
             if first is not image:
-                raise BoardRefusedError(refusals.duplicate(first.name))
+                raise BoardRefusedError(f"same picture as {first.name}")
             return detect_board(image.grey(), pattern)
         except BoardRefusedError as refused:
-            return RefusedImage(image.name, refused.reason)
+            return RefusedImage(image.name, str(refused))
         finally:
             if progress is not None:
                 progress(next(done))
@@ -81,12 +85,16 @@ def detect_boards(
             _check_sharp(board, usual_px)
             _check_new(image, board, kept)
             if not whole_seen:
-                raise BoardRefusedError(refusals.outer_line_missing(pattern))
+                # 7x6 corners whose far edge is out of sight look like 8x6 that lack a column.
+                raise BoardRefusedError(
+                    f"a row or column of {pattern} corners is out of sight, and no other picture "
+                    "shows all of them; take one that does, or correct --pattern"
+                )
             kept.append((image, board))
             view = BoardView(image.name, board.ids, board.uv_px, image.width, image.height)
             views.append(view if framing is None else crop_view(view, framing))
         except BoardRefusedError as error:
-            refused.append(RefusedImage(image.name, error.reason))
+            refused.append(RefusedImage(image.name, str(error)))
     return DetectedBoards(pattern, views, refused, len(images), images_hash(images))
 
 
@@ -100,7 +108,10 @@ def _shows_outer_lines(board: DetectedBoard, pattern: BoardPattern) -> bool:
 def _check_sharp(board: DetectedBoard, usual_px: float) -> None:
     wide = board.blur_px > max(_BLURRED_PX, _BLURRED_TIMES * usual_px)
     if wide or board.blur_px >= max(_BLURRED_SQUARE * board.spacing_px, 1.0):
-        raise BoardRefusedError(refusals.blurred(2 * board.blur_px, 2 * usual_px))
+        raise BoardRefusedError(
+            f"blurred: its edges are {2 * board.blur_px:.1f} px wide (usual here: "
+            f"{2 * usual_px:.1f}); take it again with the board held still"
+        )
 
 
 def _check_new(
@@ -111,9 +122,9 @@ def _check_new(
     for other, known in kept:
         shift_px = rms_shift_px(board, known, 0.8 * min(len(board.ids), len(known.ids)))
         if shift_px < _SAME_PX:
-            raise BoardRefusedError(refusals.duplicate(other.name))
+            raise BoardRefusedError(f"same picture as {other.name}")
         if image.moving and other.moving and shift_px < _SAME_MOVING * image.width:
-            raise BoardRefusedError(refusals.not_moved(other.name))
+            raise BoardRefusedError(f"the board has not moved since {other.name}")
 
 
 def crop_view(view: BoardView, framing: Framing) -> BoardView:
@@ -128,5 +139,5 @@ def crop_view(view: BoardView, framing: Framing) -> BoardView:
     width, height = framing.crop_wh
     inside = (uv >= 0).all(1) & (uv <= [width - 1, height - 1]).all(1)
     if inside.sum() < FEWEST_CORNERS:
-        raise BoardRefusedError(refusals.OUTSIDE_CROP)
+        raise BoardRefusedError("lies outside the square crop")
     return BoardView(view.name, view.ids[inside], uv[inside], width, height)

@@ -146,15 +146,15 @@ def command(
     if report_path is not None:
         require("matplotlib", extra="calibrate")
     _check_outputs(images, config_path, out or _DEFAULT_OUT, report_path, json_path)
-    from bikeped.lab.cli.calibrate_capture import live_pictures
     from bikeped.lab.cli.calibrate_run import (
         CalibrateOptions,
         camera_config,
         images_of,
+        live_pictures,
+        print_result,
         run,
         write_outputs,
     )
-    from bikeped.lab.cli.calibrate_tables import print_result
 
     number = None if terms is None else int(terms)
     options = CalibrateOptions(board, model, number, board_shape, compare, folds or 0)

@@ -1,39 +1,87 @@
-"""The work of `bikeped calibrate`, from files to files."""
+"""The work of `bikeped calibrate`, from files or a live camera to files and the console."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bikeped.cli.common import progress_bar, write_json
+import click
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bikeped.capture import open_source
+from bikeped.cli.common import progress_bar, text_table, write_json
 from bikeped.config import LoadedConfig, framing, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 from bikeped.geometry import canonical_projection
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.capture.coverage import measure_coverage
+from bikeped.lab.calibration.capture.guide import CaptureGuide
 from bikeped.lab.calibration.capture.images import CalibrationImage, load_images
+from bikeped.lab.calibration.capture.live_session import LivePage, LiveSession, capture_boards
+from bikeped.lab.calibration.corners.candidates import assumed_lens
 from bikeped.lab.calibration.image_pipeline import detect_boards
-from bikeped.lab.calibration.report.calibration_file import calibration_data, write_calibration
 from bikeped.lab.calibration.report.field_of_view import (
     brightest_pixels,
     circle_radius_px,
     field_of_view,
 )
 from bikeped.lab.calibration.report.results import (
+    MODEL_COLUMNS,
     CalibrationResult,
     calibration_cautions,
+    calibration_data,
+    model_row,
     result_data,
+    write_calibration,
 )
-from bikeped.lab.calibration.solver.lens_model import LensModel
+from bikeped.lab.calibration.solver.lens_model import CornerObservations, LensModel
 from bikeped.lab.calibration.solver.model_comparison import (
     comparison_models,
     fit_models,
+    paper_criterion,
     recommend_model,
 )
 from bikeped.lab.calibration.solver.observations import prepare_observations
+
+DEFAULT_FOLDER = Path("calibration-pictures")
+
+
+def live_pictures(
+    images: Sequence[Path], pattern: BoardPattern, loaded: LoadedConfig, screen: Console
+) -> tuple[Path, ...]:
+    """Guides a person before the configured camera; returns the folder of the pictures.
+
+    Ends when there are enough, when the source ends, or with Ctrl-C, which keeps those taken.
+    """
+    if len(images) > 1:
+        raise BikepedError("IMAGES: with --live one folder for the pictures, not several")
+    folder = images[0] if images else DEFAULT_FOLDER
+    if folder.exists() and not folder.is_dir():
+        raise BikepedError(f"IMAGES {folder}: with --live the folder for the pictures, not a file")
+    camera = loaded.config.camera
+    lens, centre = assumed_lens(camera.width, camera.height)
+    guide = CaptureGuide(pattern, camera.width, camera.height, lens, centre)
+    session = LiveSession(guide)
+    source = open_source(camera)
+    try:
+        with LivePage(session, port=loaded.config.web.port) as page:
+            screen.print(f"pictures go into {escape(str(folder))}; Ctrl-C when you have enough")
+            screen.print(f"open {page.url}" if page.url else f"no page: {page.error}")
+            try:
+                capture_boards(source, guide, folder, session, say=lambda line: screen.print(line))
+            except KeyboardInterrupt:
+                session.stop()
+                click.echo("bikeped: interrupted; calibrating from what was kept", err=True)
+    finally:
+        source.close()
+    return (folder,)
+
 
 _CIRCLE_IMAGES = 16  # enough to see the image circle
 
@@ -124,8 +172,7 @@ def write_outputs(
 
 
 def _report(result: CalibrationResult, images: Sequence[CalibrationImage]) -> str:
-    from bikeped.lab.calibration.report.board_images import Thumbnail
-    from bikeped.lab.calibration.report.html_report import report_page
+    from bikeped.lab.calibration.report.html_report import Thumbnail, report_page
 
     offset = (0, 0) if result.framing is None else result.framing.offset_px
     return report_page(result, [Thumbnail(image.name, image.grey(), offset) for image in images])
@@ -165,3 +212,87 @@ def _configuration_cautions(loaded: LoadedConfig, size: tuple[int, int], framed:
     given = ", ".join(f"camera.{key}" for key in keys if getattr(camera, key) is not None)
     override = "which override the file; set them to null to use the measured lens"
     return [f"{loaded.source} sets {given}, {override}"] if given else []
+
+
+_MOST_NAMED = 8
+
+
+def print_result(screen: Console, result: CalibrationResult, compare: bool) -> None:
+    """Boards, models, the recommendation, and cautions."""
+    prepared, chosen = result.comparison.prepared, result.chosen
+    observations = prepared.observations
+    size = f"{observations.width} x {observations.height}"
+    where = (
+        f"pictures of {size}, taken as they are"
+        if result.framing is None
+        else f"in the {size} crop"
+    )
+    corners = int(observations.visible.sum())
+    lines = [
+        f"{len(observations)} of {prepared.images} boards, {corners} corners, {where}",
+        *partial_board_lines(observations),
+        *_first(
+            (f"  not used: {_name(r.file)}: {escape(r.reason)}" for r in prepared.refused),
+            "more (--json, --report)",
+        ),
+        *_first(
+            (
+                f"  left out: corner {c.corner} of {_name(c.file)}, {c.off_px:.1f} px off"
+                for c in prepared.outliers
+            ),
+            "more corners",
+        ),
+    ]
+    for line in lines:
+        screen.print(line)
+    screen.print(_table(result))
+    if compare:
+        screen.print(f"recommended: {result.recommendation.reason}")
+        screen.print(paper_criterion(result.comparison))
+    k = chosen.state.terms[: chosen.model.terms]
+    terms = "".join(f", k{n + 1} = {value:.6g}" for n, value in enumerate(k))
+    screen.print(f"{chosen.name}{terms}")
+    screen.print(
+        f"field of view {result.field.fov_deg:.1f} degrees; ends at {result.field.ends_at}"
+    )
+    for caution in result.cautions:
+        screen.print(f"caution: {escape(caution)}")
+
+
+def partial_board_lines(observations: CornerObservations) -> list[str]:
+    """A line for each board of which some corners are not used, the emptiest first."""
+    whole, counts = observations.pattern.count, observations.visible.sum(1)
+    rows = [int(row) for row in np.argsort(counts, kind="stable") if counts[row] < whole]
+    return _first(
+        (
+            f"  in part: {_name(observations.names[n])}, {counts[n]} of {whole} corners"
+            for n in rows
+        ),
+        "more boards in part (--json, --report)",
+    )
+
+
+def _first(lines: Iterable[str], what: str) -> list[str]:
+    """The first few lines, and one that counts the others."""
+    every = list(lines)
+    more = len(every) - _MOST_NAMED
+    return every[:_MOST_NAMED] + ([f"  and {more} {what}"] if more > 0 else [])
+
+
+def _name(file: str) -> str:
+    return escape(Path(file).name)
+
+
+def _table(result: CalibrationResult) -> Table:
+    fits, folds = result.comparison.ranked, result.comparison.folds
+    every_image = folds == len(result.comparison.prepared.observations)
+    how = (
+        "each picture from all others" if every_image else f"each of {folds} folds from the others"
+    )
+    rows = [model_row(fit) for fit in fits]
+    return text_table(
+        MODEL_COLUMNS,
+        [(f"{row[0]} *" if row[0] == result.chosen.name else row[0], *row[1:]) for row in rows],
+        title=f"error in px; cross-validated: {how}",
+        note="* goes into the calibration file" if len(fits) > 1 else "",
+    )

@@ -10,8 +10,13 @@ from synthetic_boards import BoardBend, DrawnCamera, draw_views, spread_poses
 
 from bikeped.geometry import Lens
 from bikeped.geometry.lens import Projection
-from bikeped.lab.calibration.board_view import BoardPattern, BoardView, DetectedBoards, RefusedImage
-from bikeped.lab.calibration.refusals import BoardRefusedError
+from bikeped.lab.calibration.board_view import (
+    BoardPattern,
+    BoardRefusedError,
+    BoardView,
+    DetectedBoards,
+    RefusedImage,
+)
 
 PATTERN = BoardPattern(8, 6, 0.1)
 FLAT = BoardBend()
@@ -50,7 +55,7 @@ def refusal_of(detect: Callable[..., object], *arguments: object) -> str:
     """The reason for which a detector refuses an image."""
     with pytest.raises(BoardRefusedError) as caught:
         detect(*arguments)
-    return caught.value.reason
+    return str(caught.value)
 
 
 def found(views: Sequence[BoardView], refused: Sequence[RefusedImage] = ()) -> DetectedBoards:

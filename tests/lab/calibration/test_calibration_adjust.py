@@ -14,16 +14,16 @@ from bikeped.geometry import GroundCamera, Lens
 from bikeped.geometry.lens import Projection
 from bikeped.lab.calibration.board_view import BoardView
 from bikeped.lab.calibration.solver import bundle_adjustment as adjust_module
-from bikeped.lab.calibration.solver import cross_validation as validate_module
+from bikeped.lab.calibration.solver import lens_fit as validate_module
 from bikeped.lab.calibration.solver.board_shape import gauge_basis
 from bikeped.lab.calibration.solver.bundle_adjustment import AdjustmentStage, adjust, minimise
-from bikeped.lab.calibration.solver.cross_validation import (
+from bikeped.lab.calibration.solver.initial_guess import first_guess, median_errors_px
+from bikeped.lab.calibration.solver.lens_fit import (
     assign_folds,
+    fit_lens,
     fit_poses,
     held_out_residuals,
 )
-from bikeped.lab.calibration.solver.initial_guess import first_guess, median_errors_px
-from bikeped.lab.calibration.solver.lens_fit import fit_lens
 from bikeped.lab.calibration.solver.lens_model import CornerObservations, LensModel, residuals
 from bikeped.lab.calibration.solver.model_comparison import initial_state
 from bikeped.lab.calibration.solver.observations import prepare_observations

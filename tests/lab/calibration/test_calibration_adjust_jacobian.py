@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from bikeped.geometry import Lens
 from bikeped.geometry.lens import Projection
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.solver.jacobian import jacobian
 from bikeped.lab.calibration.solver.lens_model import (
     PLAIN,
     CalibrationState,
@@ -24,6 +23,7 @@ from bikeped.lab.calibration.solver.lens_model import (
 from bikeped.lab.calibration.solver.normal_equations import (
     AdjustmentStep,
     apply_step,
+    jacobian,
     normal_equations,
 )
 

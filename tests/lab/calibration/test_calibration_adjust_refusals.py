@@ -12,9 +12,8 @@ from synthetic_boards import BoardPose, DrawnCamera, draw_views, spread_poses, t
 
 from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens
-from bikeped.lab.calibration.board_view import BoardView, RefusedImage
+from bikeped.lab.calibration.board_view import BoardRefusedError, BoardView, RefusedImage
 from bikeped.lab.calibration.image_pipeline import crop_view
-from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.lab.calibration.solver.lens_model import LensModel
 from bikeped.lab.calibration.solver.model_comparison import fit_models
 from bikeped.lab.calibration.solver.observations import prepare_observations

@@ -8,10 +8,9 @@ from calibration_scenes import refusal_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.board_view import BoardPattern, BoardRefusedError
 from bikeped.lab.calibration.corners.corner_ids import LEAST_IN_LINE, assign_corner_ids
 from bikeped.lab.calibration.corners.grid_growing import CornerGrid
-from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.types import BoolArray, ImageArray, IntArray
 
 SIDE = 12

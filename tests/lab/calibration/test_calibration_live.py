@@ -27,8 +27,12 @@ from bikeped.lab.calibration.capture.coverage import (
     measure_coverage,
 )
 from bikeped.lab.calibration.capture.guide import CaptureGuide, FrameStatus
-from bikeped.lab.calibration.capture.live_page import LivePage, add_live_page
-from bikeped.lab.calibration.capture.live_session import LiveSession, capture_boards
+from bikeped.lab.calibration.capture.live_session import (
+    LivePage,
+    LiveSession,
+    add_live_page,
+    capture_boards,
+)
 from bikeped.lab.calibration.corners.candidates import assumed_lens
 from bikeped.types import Frame, ImageArray
 from bikeped.web.security import load_access_policy

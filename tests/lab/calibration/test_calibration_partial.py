@@ -13,13 +13,11 @@ from calibration_scenes import refusal_of
 from synthetic_boards import BoardPose, DrawnCamera, spread_poses, true_corners
 
 from bikeped.geometry import Lens
-from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.board_view import BoardPattern, BoardRefusedError
 from bikeped.lab.calibration.capture.images import CalibrationImage
 from bikeped.lab.calibration.corners.board_check import DetectedBoard
-from bikeped.lab.calibration.corners.board_detector import detect_board
-from bikeped.lab.calibration.corners.partial_board import LEAST_SHARE, partial_board
+from bikeped.lab.calibration.corners.board_detector import LEAST_SHARE, detect_board, partial_board
 from bikeped.lab.calibration.image_pipeline import detect_boards
-from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.lab.calibration.solver.bundle_adjustment import adjust
 from bikeped.lab.calibration.solver.lens_model import LensModel
 from bikeped.lab.calibration.solver.observations import prepare_observations

@@ -19,16 +19,19 @@ from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens
 from bikeped.lab.calibration.board_view import RefusedImage
 from bikeped.lab.calibration.capture.coverage import CircleSector, Coverage
-from bikeped.lab.calibration.report.board_images import Thumbnail
-from bikeped.lab.calibration.report.calibration_file import calibration_data, write_calibration
 from bikeped.lab.calibration.report.field_of_view import (
     FieldOfView,
     brightest_pixels,
     circle_radius_px,
     field_of_view,
 )
-from bikeped.lab.calibration.report.html_report import report_page
-from bikeped.lab.calibration.report.results import CalibrationResult, calibration_cautions
+from bikeped.lab.calibration.report.html_report import Thumbnail, report_page
+from bikeped.lab.calibration.report.results import (
+    CalibrationResult,
+    calibration_cautions,
+    calibration_data,
+    write_calibration,
+)
 from bikeped.lab.calibration.solver.lens_model import LensModel
 from bikeped.lab.calibration.solver.model_comparison import (
     ModelComparison,

@@ -25,7 +25,7 @@ from bikeped.config import ground_camera, load_config
 from bikeped.geometry import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.lab.calibration.solver.lens_model import CornerObservations
-from bikeped.lab.cli.calibrate_tables import partial_board_lines
+from bikeped.lab.cli.calibrate_run import partial_board_lines
 
 PATTERN = BoardPattern(8, 6, 0.1)
 REAL = SHARED / "media" / "fisheye-checkerboard"

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.geometry import Lens
-from bikeped.lab.calibration.board_view import BoardPattern, BoardView
+from bikeped.lab.calibration.board_view import BoardPattern, BoardRefusedError, BoardView
 from bikeped.lab.calibration.capture.coverage import Coverage, corner_counts, measure_coverage
 from bikeped.lab.calibration.corners.board_check import DetectedBoard, rms_shift_px
 from bikeped.lab.calibration.corners.board_detector import check_pattern, detect_board
-from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.types import FloatArray, ImageArray
 
 FEWEST, MOST = 12, 40
@@ -94,7 +93,7 @@ class CaptureGuide:
         try:
             board = detect_board(grey, self.pattern, thorough=False)
         except BoardRefusedError as refused:
-            return FrameVerdict(FrameStatus.NO_BOARD, refused.reason, np.empty((0, 2)))
+            return FrameVerdict(FrameStatus.NO_BOARD, str(refused), np.empty((0, 2)))
         self._last = time_s, board
         status, text = self._classify(board, time_s, before)
         if status is FrameStatus.KEPT:

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bikeped.lab.calibration import refusals
-from bikeped.lab.calibration.board_view import BoardPattern, BoardView
+from bikeped.lab.calibration.board_view import (
+    BoardPattern,
+    BoardRefusedError,
+    BoardView,
+    larger_board,
+    too_few_corners,
+)
 from bikeped.lab.calibration.corners.corner_refinement import (
     RefinedCorners,
     is_edge_crossing,
@@ -23,7 +28,6 @@ from bikeped.lab.calibration.corners.local_grid import (
     neighbour_residual,
     repair_corners,
 )
-from bikeped.lab.calibration.refusals import BoardRefusedError
 from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
 
 _ROUGH = 0.3  # squares: a candidate's corner further off its neighbours' expectation is wrong ...
@@ -53,7 +57,7 @@ def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> D
     position = grid_positions(pattern, ids)
     repaired = repair_corners(position, uv_px, _ROUGH, int(_REPAIRABLE * pattern.count))
     if repaired is None:
-        raise BoardRefusedError(refusals.IRREGULAR)
+        raise BoardRefusedError("its corners make no regular board")
     uv = orient_corners(grey, pattern, repaired)
     near = local_map(position, position, uv)
     uv = refine_by_gradient(grey, near, uv)
@@ -65,10 +69,10 @@ def check_board(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -> D
         if better.sum() > good.sum():
             refined, good = again, better
     if good.mean() < _KEPT:
-        raise BoardRefusedError(refusals.too_few_corners(int(good.sum()), pattern))
+        raise BoardRefusedError(too_few_corners(int(good.sum()), pattern))
     ids, position, uv = ids[good], position[good], refined.uv_px[good]
     if _continues_beyond(grey, pattern, position, uv):
-        raise BoardRefusedError(refusals.larger_board(pattern))
+        raise BoardRefusedError(larger_board(pattern))
     if not good.all():  # a wrong corner gave its neighbours a wrong bend
         refined = refine_corners(grey, position, uv)
         uv = refined.uv_px

@@ -11,11 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.lab.calibration import refusals
-from bikeped.lab.calibration.board_view import BoardPattern
+from bikeped.lab.calibration.board_view import (
+    LEAST_IN_LINE,
+    BoardPattern,
+    BoardRefusedError,
+    ambiguous_place,
+    larger_board,
+)
 from bikeped.lab.calibration.corners.grid_growing import CornerGrid
 from bikeped.lab.calibration.corners.local_grid import quadrants, sample
-from bikeped.lab.calibration.refusals import LEAST_IN_LINE, BoardRefusedError
 from bikeped.types import FloatArray, ImageArray, IntArray
 
 _ENDS_AT = 2  # places at which a board is seen to end
@@ -35,7 +39,7 @@ def assign_corner_ids(grey: ImageArray, pattern: BoardPattern, grid: CornerGrid)
     wanted = np.array([pattern.columns, pattern.rows])
     size = _GridBounds.of(grid, 1).size
     if not ((size <= wanted).all() or (size[::-1] <= wanted).all()):
-        raise BoardRefusedError(refusals.larger_board(pattern, size))
+        raise BoardRefusedError(larger_board(pattern, size))
     orientations: list[_Orientation] = []
     reasons: list[str] = []
     for turns in range(4):
@@ -46,20 +50,21 @@ def assign_corner_ids(grey: ImageArray, pattern: BoardPattern, grid: CornerGrid)
         try:
             first = _first_cell(grey, pattern, turned, bounds)
         except BoardRefusedError as refused:
-            reasons.append(refused.reason)
+            reasons.append(str(refused))
             continue
         position = turned.cell - first
         if (position < 0).any() or (position >= wanted).any():
-            reasons.append(refusals.BEYOND_MARGIN)
+            reasons.append("some of its corners lie beyond its white margin: something hides it")
             continue
         dark = bool(first.sum() % 2 == 0) == turned.dark
         orientations.append(_Orientation(position, dark, bounds.size))
     if not orientations:
-        raise BoardRefusedError([*reasons, refusals.OUTER_LINES_HIDDEN][0])
+        hidden = f"fewer than {LEAST_IN_LINE} corners of its outer rows and columns can be seen"
+        raise BoardRefusedError([*reasons, hidden][0])
     allowed = [one for one in orientations if one.dark]
     if not allowed and (orientations[0].size < wanted).any():
         # An edge that is taken for the board's own shifts all by a line, which turns the colours.
-        raise BoardRefusedError(refusals.ambiguous_place(pattern, orientations[0].size))
+        raise BoardRefusedError(ambiguous_place(pattern, orientations[0].size))
     best = max(allowed or orientations, key=lambda one: _rightward(grid, one.position))
     return np.asarray(best.position[:, 1] * pattern.columns + best.position[:, 0], np.int64)
 
@@ -117,19 +122,22 @@ def _first_cell(
     missing = wanted - bounds.size
     fits_turned = wanted[0] != wanted[1] and bool((bounds.size[::-1] <= wanted).all())
     if missing.sum() > 1 or (missing.any() and fits_turned):
-        raise BoardRefusedError(refusals.ambiguous_place(pattern, bounds.size))
+        raise BoardRefusedError(ambiguous_place(pattern, bounds.size))
     for axis in (0, 1):
         edges = [_BoardEdge.of(grey, grid, bounds, axis, way) for way in (-1, 1)]
         if missing[axis]:
             before, after = (edge.is_outer_edge for edge in edges)
             if before == after:
-                raise BoardRefusedError(refusals.ambiguous_place(pattern, bounds.size))
+                raise BoardRefusedError(ambiguous_place(pattern, bounds.size))
             out[axis] -= int(after)
         elif any(edge.continues >= _CONTINUES_AT for edge in edges):
             larger = bounds.size + (np.arange(2) == axis)
-            raise BoardRefusedError(refusals.larger_board(pattern, larger))
+            raise BoardRefusedError(larger_board(pattern, larger))
         elif all(edge.ends < _ENDS_AT for edge in edges):
-            raise BoardRefusedError(refusals.no_margin(int(wanted[axis]), axis))
+            raise BoardRefusedError(
+                f"{wanted[axis]} {('columns', 'rows')[axis]} are in sight, but no white margin on "
+                "either side of them: there may be more; show an outer edge of the board"
+            )
     return out
 
 

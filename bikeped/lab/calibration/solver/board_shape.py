@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bikeped.lab.calibration.board_view import BoardPattern
-from bikeped.lab.calibration.solver.jacobian import jacobian
 from bikeped.lab.calibration.solver.lens_model import CalibrationState, CornerObservations
+from bikeped.lab.calibration.solver.normal_equations import jacobian
 from bikeped.types import FloatArray, IntArray
 
 #: Prior standard deviations in squares, out of the plane and in it: bends reach some percent of a

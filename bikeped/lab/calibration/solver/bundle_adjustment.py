@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bikeped.lab.calibration.solver.board_shape import gauge_basis, prior_weights
-from bikeped.lab.calibration.solver.jacobian import Jacobian, jacobian
 from bikeped.lab.calibration.solver.lens_model import (
     PLAIN,
     CalibrationState,
@@ -23,8 +22,10 @@ from bikeped.lab.calibration.solver.lens_model import (
     residuals,
 )
 from bikeped.lab.calibration.solver.normal_equations import (
+    Jacobian,
     NormalEquations,
     apply_step,
+    jacobian,
     normal_equations,
     single_threaded,
 )

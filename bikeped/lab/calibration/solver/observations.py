@@ -14,7 +14,6 @@ import numpy as np
 from bikeped.errors import CalibrationError
 from bikeped.geometry.lens import unit_angle
 from bikeped.lab.calibration.board_view import DetectedBoards, RefusedImage
-from bikeped.lab.calibration.refusals import contradicts_others
 from bikeped.lab.calibration.solver.board_shape import align_numbering
 from bikeped.lab.calibration.solver.bundle_adjustment import AdjustmentResult, adjust
 from bikeped.lab.calibration.solver.initial_guess import FISHEYE, first_guess, median_errors_px
@@ -93,7 +92,10 @@ def prepare_observations(boards: DetectedBoards) -> PreparedObservations:
         median_px = median_errors_px(state, observations)
         names = observations.names
         refused += [
-            RefusedImage(names[row], contradicts_others(float(median_px[row])))
+            RefusedImage(
+                names[row],
+                f"its corners do not fit the other boards (median {median_px[row]:.1f} px off)",
+            )
             for row in np.flatnonzero(useless)
         ]
         outliers += [
