@@ -113,26 +113,12 @@ class FigureSheet:
             w_pad=0.06,
             h_pad=0.05,
         )
-        left = _MARGIN_IN / width
-        self.figure.text(
-            left,
-            1 - _MARGIN_IN / total,
-            # A dollar sign in the name of a scenario is not mathematics.
-            escape_dollars("\n".join(title_lines)),
-            fontsize=_TITLE_PT,
-            fontweight="bold",
-            va="top",
-            color=BLACK,
-        )
-        self.figure.text(
-            left,
-            _MARGIN_IN / total,
-            escape_dollars("\n".join(lines)),
-            fontsize=_CAPTION_PT,
-            va="bottom",
-            color=DARK,
-            linespacing=1.3,
-        )
+        left, margin = _MARGIN_IN / width, _MARGIN_IN / total
+        bold = {"fontsize": _TITLE_PT, "fontweight": "bold", "va": "top", "color": BLACK}
+        small = {"fontsize": _CAPTION_PT, "va": "bottom", "color": DARK, "linespacing": 1.3}
+        # A dollar sign in the name of a scenario is not mathematics.
+        self.figure.text(left, 1 - margin, escape_dollars("\n".join(title_lines)), bold)
+        self.figure.text(left, margin, escape_dollars("\n".join(lines)), small)
         grid = self.figure.subplots(rows, columns, squeeze=False, **subplots)
         self.axes: list[Axes] = list(grid.ravel())
 
@@ -165,7 +151,8 @@ class FigureSheet:
         self.axes[0].set_yticks(range(len(labels)), [escape_dollars(text) for text in labels])
         self.axes[0].set_ylim(len(labels) - 1 - top, top)
         for axes in self.axes:
-            hide_y_lines(axes)
+            axes.grid(visible=False, axis="y")
+            axes.tick_params(axis="y", length=0)
 
     def colour_bar(self, image: Any, label: str, extend: str, **place: Any) -> None:
         """A bar beside all panels that explains an image's colours."""
@@ -207,12 +194,6 @@ def plot_series(axes: Axes, x: Any, y: Any, style: SeriesStyle, **more: Any) -> 
 def fill(colour: str, hatch: str = "") -> dict[str, Any]:
     """Keywords of a bar or patch without edges."""
     return {"facecolor": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0}
-
-
-def hide_y_lines(axes: Axes) -> None:
-    """No grid lines and tick marks at the rows of a vertical axis of names."""
-    axes.grid(visible=False, axis="y")
-    axes.tick_params(axis="y", length=0)
 
 
 def means_and_arms(summaries: Iterable[Mapping[str, Any]]) -> tuple[FloatArray, FloatArray]:

@@ -17,8 +17,8 @@ from bikeped.lab.cli.conformance_shared import (
     burst_option,
     curve_option,
     experiment_options,
-    print_table,
     processes_option,
+    rich_table,
     trials_option,
 )
 
@@ -313,7 +313,7 @@ def reproduce(
     compared = data["compare"]["configurations"].items()
     rows = [(name, *cells(metrics, METRIC_COLUMNS)) for name, metrics in compared]
     columns = ("configuration", *METRIC_COLUMNS)
-    print_table(run.console, ResultTable("compare", "Configurations", columns, rows))
+    run.console.print(rich_table(ResultTable("compare", "Configurations", columns, rows)))
     run.console.print(
         f"{len(found.results)} experiments ({len(found.reused)} were there already), "
         f"{len(found.figures)} figure files in {escape(str(out))}"

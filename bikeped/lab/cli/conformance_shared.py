@@ -89,7 +89,7 @@ class SuiteRun:
 
     def provenance(self, seed: int | None = None) -> dict[str, Any]:
         """The keys that every experiment's JSON begins with."""
-        from bikeped.lab.experiments.deterministic import result_provenance
+        from bikeped.lab.simulation.suite import result_provenance
 
         return result_provenance(self.suite, self.loaded, self.seed if seed is None else seed)
 
@@ -99,7 +99,7 @@ class SuiteRun:
             self.write_json({**self.provenance(seed), **result.data})
         if self.json_path != "-":
             for table in result.tables:
-                print_table(self.console, table)
+                self.console.print(rich_table(table))
                 self.console.print()
 
 
@@ -164,11 +164,6 @@ burst_option = click.option(
     show_default=True,
     help="Mean length of a burst of missed detections, in frames.",
 )
-
-
-def print_table(screen: Console, table: ResultTable) -> None:
-    """Prints a result's table for people."""
-    screen.print(rich_table(table))
 
 
 def rich_table(table: ResultTable) -> RichTable:

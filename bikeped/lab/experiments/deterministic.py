@@ -14,7 +14,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig
 from bikeped.decision.episodes import onsets
 from bikeped.errors import ScenarioError
@@ -22,7 +21,7 @@ from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells
 from bikeped.lab.scenarios.scenario import SIZES_M
 from bikeped.lab.simulation.metrics import Metrics, finite_or_none, measure
 from bikeped.lab.simulation.perception import error_table, localise
-from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, camera_json, compare, compare_json
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruthSettings
 from bikeped.types import State
 
@@ -43,19 +42,6 @@ STOPPING_MARGINS = (0.6, 0.8, 1.0)
 TTC_BOUNDS_S = (2.0, 3.0, 4.0)
 MAP_STEP_M = 0.5
 MAP_REACH_M = 25.0
-
-
-def result_provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
-    """Version, hashes, camera and seed: what a result depends on."""
-    return {
-        "version": __version__,
-        "scenarios": len(suite.scenarios),
-        "suite_hash": suite.hash,
-        "config_hash": loaded.hash,
-        "calibration_hash": loaded.calibration_hash,
-        "camera": camera_json(suite),
-        "seed": seed,
-    }
 
 
 def select_scenario(suite: Suite, name: str) -> Suite:

@@ -174,11 +174,8 @@ def draw_all(data: Mapping[str, Mapping[str, Any]], suite: Suite, folder: Path) 
         if not found or not found.get(figure.needs):
             continue
         caption = figure.caption
-        if figure.experiment not in (
-            "errors",
-            "deployment",
-            "placement",
-        ):  # with own objects, roads
+        # Those three have their own objects and roads.
+        if figure.experiment not in ("errors", "deployment", "placement"):
             caption += f" On {len(suite.scenarios)} scenarios."
         paths += figure.draw(found, figure.title, caption, folder)
     return paths

@@ -27,7 +27,6 @@ from bikeped.lab.experiments.deterministic import (
     braking_profiles,
     compare_table,
     localisation_errors,
-    result_provenance,
     run_table,
     truth_sensitivity,
     warning_budgets,
@@ -36,7 +35,7 @@ from bikeped.lab.experiments.trials import BURST_FRAMES, TRIALS, montecarlo
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.simulation.perception import RecallCurve, RecallModel, recall_models
-from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
+from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, result_provenance
 
 #: Parts of bikeped whose source decides what an experiment gives.
 _CODE = (*DECIDING_CODE, *MEASURING_CODE, "config", "types")

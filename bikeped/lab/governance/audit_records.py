@@ -16,17 +16,18 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig, config_hash, rule_settings
 from bikeped.config.provenance import decision_hash
 from bikeped.errors import BikepedError
 from bikeped.files import WholeFile
 from bikeped.lab.simulation.simulate import RuleInput, verdicts
-from bikeped.lab.simulation.suite import Suite, camera_json
+from bikeped.lab.simulation.suite import Suite, result_provenance
 from bikeped.types import FloatArray, State
 
 #: Decimals of a record: 0.1 mm, 0.1 ms.
 _DIGITS = 4
+#: What a record holds of the pair checks.
+_CHECKED = ("distance_m", "distance_then_m", "lookback_s", "displacement_m", "d_max_m")
 
 
 def write_audit(
@@ -57,13 +58,9 @@ def audit_records(
     rows_of_frame = np.searchsorted(run.rows.frame, np.arange(len(run.time_s) + 1))
     config = msgspec.structs.replace(loaded.config, decision=decision)
     common = {
-        "version": __version__,
+        **result_provenance(suite, loaded, seed),
         "config_hash": config_hash(config, loaded.calibration_hash),
         "decision_hash": decision_hash(decision),
-        "calibration_hash": loaded.calibration_hash,
-        "suite_hash": suite.hash,
-        "seed": seed,
-        "camera": camera_json(suite),
         "decision": msgspec.to_builtins(decision),
     }
     for index, scenario in enumerate(suite.scenarios):
@@ -129,11 +126,7 @@ def _first_fired(run: RuleInput, decision: DecisionConfig) -> dict[int, dict[str
             {
                 "cyclist": int(rows.id[cyclist]),
                 "pedestrian": int(rows.id[pedestrian]),
-                "distance_m": _real(found.distance_m[index]),
-                "distance_then_m": _real(found.distance_then_m[index]),
-                "lookback_s": _real(found.lookback_s[index]),
-                "displacement_m": _real(found.displacement_m[index]),
-                "d_max_m": _real(found.d_max_m[index]),
+                **{key: _real(getattr(found, key)[index]) for key in _CHECKED},
             },
         )
     return out

@@ -50,10 +50,10 @@ class Gate:
 
     name: str
     required: float
+    strict: bool
+    unit: str
     measured: float
     holds: bool
-    unit: str
-    strict: bool = False
 
     def format_value(self, value: float) -> str:
         """A value in the gate's unit; one that fails never reads like one that holds.
@@ -76,14 +76,7 @@ class Gate:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "name": self.name,
-            "required": self.required,
-            "strict": self.strict,
-            "unit": self.unit,
-            "measured": finite_or_none(self.measured),
-            "holds": self.holds,
-        }
+        return {**vars(self), "measured": finite_or_none(self.measured)}
 
 
 def check_gates(metrics: Metrics) -> list[Gate]:
@@ -101,7 +94,7 @@ def check_gate_figures(figures: Mapping[str, Any]) -> list[Gate]:
         value = figures.get(key)
         measured = math.nan if value is None else float(value)
         holds = measured > required if strict else measured >= required
-        return Gate(name, required, measured, holds, unit, strict)
+        return Gate(name, required, strict, unit, measured, holds)
 
     return [
         gate("Sensitivity over actionable frames", "sensitivity", SENSITIVITY_MIN, "%"),

@@ -52,7 +52,7 @@ class Variant:
             "scenarios": len(self.suite.scenarios),
             "decision": msgspec.to_builtins(self.decision),
             "decision_hash": decision_hash(self.decision),
-            "truth": truth_dict(self.suite.truth_settings),
+            "truth": asdict(self.suite.truth_settings),
             "totals": self.metrics.as_dict(),
             "gates": [gate.as_dict() for gate in check_gates(self.metrics)],
             "promotable": all_hold(check_gates(self.metrics)),
@@ -76,11 +76,8 @@ class Comparison:
     changed: list[dict[str, Any]]
 
     def as_dict(self) -> dict[str, Any]:
-        return {
-            "before": self.before.as_dict(),
-            "after": self.after.as_dict(),
-            "changed": self.changed,
-        }
+        sides = {"before": self.before.as_dict(), "after": self.after.as_dict()}
+        return {**sides, "changed": self.changed}
 
 
 def compare_variants(
@@ -180,11 +177,6 @@ def apply_bounds(decision: DecisionConfig, items: Sequence[str]) -> DecisionConf
             f"{decision.d_max_m:g}; choose bounds that overlap"
         )
     return decision
-
-
-def truth_dict(settings: GroundTruthSettings) -> dict[str, Any]:
-    """The ground-truth thresholds for JSON; null: the definition's own."""
-    return asdict(settings)
 
 
 def _differences(old: Variant, new: Variant, name: str, index: int) -> dict[str, Any]:

@@ -7,7 +7,7 @@ thousands of times.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from bikeped.types import BoolArray, FloatArray, IntArray, State
 #: An ALERT episode in which a pair came this near is a nuisance, not a false alarm.
 NUISANCE_M = 5.0
 NO_ALERT_LATENCY_S = 5.0
+_JOINED = ("time_s", "danger", "actionable", "severity", "budget_s", "nearest_m")
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class GroundTruthFrames:
     budget_s: FloatArray
     nearest_m: FloatArray
     closest_s: FloatArray  #: [scenario] time of the closest approach; NaN without a pair
-    count: int = field(default=0)
+    count: int
 
     @staticmethod
     def join(truths: Sequence[GroundTruth]) -> GroundTruthFrames:
@@ -47,21 +48,14 @@ class GroundTruthFrames:
             return np.concatenate([getattr(truth, name) for truth in truths])
 
         closest = [
-            float(t.time_s[int(np.argmin(t.nearest_m))])
-            if np.isfinite(t.nearest_m).any()
-            else np.nan
+            t.time_s[np.argmin(t.nearest_m)] if np.isfinite(t.nearest_m).any() else np.nan
             for t in truths
         ]
         return GroundTruthFrames(
             start=np.concatenate([[0], np.cumsum(lengths)[:-1]]),
             scenario=np.repeat(np.arange(len(truths)), lengths),
-            time_s=joined("time_s"),
-            danger=joined("danger"),
-            actionable=joined("actionable"),
+            **{name: joined(name) for name in _JOINED},
             contact=joined("actionable") & np.isfinite(joined("ttc_s")),
-            severity=joined("severity"),
-            budget_s=joined("budget_s"),
-            nearest_m=joined("nearest_m"),
             closest_s=np.asarray(closest),
             count=len(truths),
         )

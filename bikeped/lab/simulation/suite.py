@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig, ground_camera, rule_settings
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
@@ -25,36 +26,28 @@ from bikeped.lab.simulation.simulate import (
 )
 from bikeped.lab.simulation.truth import GroundTruth, GroundTruthSettings, compute_ground_truth
 
-_SELECTED = DecisionConfig()
 DEFAULT_GROUND_TRUTH = GroundTruthSettings()
+
+
+def _closing(
+    memory: int, d_min_m: float, d_max_m: float, displacement_m: float, k: int, *, adaptive: bool
+) -> DecisionConfig:
+    return DecisionConfig(
+        memory_frames=memory,
+        d_min_m=d_min_m,
+        d_max_m=d_max_m,
+        min_displacement_m=displacement_m,
+        lookback_frames=k,
+        speed_adaptive=adaptive,
+    )
+
 
 #: The configurations and rules that are compared (definitions, section 8).
 CONFIGURATIONS: dict[str, DecisionConfig] = {
-    "selected": _SELECTED,
-    "conservative": DecisionConfig(
-        memory_frames=60,
-        d_min_m=1.5,
-        d_max_m=15,
-        min_displacement_m=0.05,
-        lookback_frames=3,
-        speed_adaptive=False,
-    ),
-    "narrow": DecisionConfig(
-        memory_frames=0,
-        d_min_m=2.0,
-        d_max_m=10,
-        min_displacement_m=0.1,
-        lookback_frames=3,
-        speed_adaptive=False,
-    ),
-    "speed_adaptive": DecisionConfig(
-        memory_frames=60,
-        d_min_m=1.0,
-        d_max_m=20,
-        min_displacement_m=0.05,
-        lookback_frames=2,
-        speed_adaptive=True,
-    ),
+    "selected": DecisionConfig(),
+    "conservative": _closing(60, 1.5, 15, 0.05, 3, adaptive=False),
+    "narrow": _closing(0, 2.0, 10, 0.1, 3, adaptive=False),
+    "speed_adaptive": _closing(60, 1.0, 20, 0.05, 2, adaptive=True),
     "distance_only": DecisionConfig(
         rule="distance", d_max_m=10, min_displacement_m=0, speed_adaptive=False
     ),
@@ -171,17 +164,23 @@ def compare_json(
             "by_scenario": {name: metrics.scenario_dict(i) for i, name in enumerate(suite.names)},
         }
 
+    parts = {
+        part: {name: block(metrics) for name, metrics in found.items()}
+        for part, found in results.items()
+    }
+    return {**result_provenance(suite, loaded, seed), **parts}
+
+
+def result_provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str, Any]:
+    """Version, hashes, camera and seed: what a result depends on."""
     return {
+        "version": __version__,
         "scenarios": len(suite.scenarios),
         "suite_hash": suite.hash,
-        "camera": camera_json(suite),
         "config_hash": loaded.hash,
         "calibration_hash": loaded.calibration_hash,
+        "camera": camera_json(suite),
         "seed": seed,
-        **{
-            part: {name: block(metrics) for name, metrics in found.items()}
-            for part, found in results.items()
-        },
     }
 
 
