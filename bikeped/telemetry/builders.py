@@ -19,24 +19,8 @@ import numpy.typing as npt
 
 from bikeped.errors import TelemetryError
 from bikeped.faults import Fault, fault_texts
-from bikeped.telemetry.schema import (
-    CameraHealth,
-    ComponentStatus,
-    Counters,
-    EventDetection,
-    EventHeader,
-    EventLine,
-    EventTrack,
-    HealthMessage,
-    KindLabel,
-    Position,
-    ShownState,
-    StageLatency,
-    StateMessage,
-    TrackedObject,
-    TracksMessage,
-    Velocity,
-)
+from bikeped.telemetry import schema as messages
+from bikeped.telemetry.schema import EventHeader, EventLine, EventTrack, KindLabel, ShownState
 from bikeped.types import Decision, Detections, FloatArray, Kind, KindArray, Tracks
 
 VOLATILE_KEYS = ("latency_ms", "started_at")  #: the only keys that differ between two replays
@@ -69,7 +53,7 @@ def tracks_message(
     state: ShownState,
     tracks: Tracks,
     history: Mapping[int, Sequence[Sequence[float]] | FloatArray],
-) -> TracksMessage:
+) -> messages.TracksMessage:
     """The tracks message of one frame captured at `unix_s` (seconds since 1970).
 
     `history` maps a track id to its recent [x, y] in metres, oldest first; a track that it does not
@@ -79,16 +63,16 @@ def tracks_message(
     distance_m = _rounded(np.hypot(*tracks.xy_m.T), 3)
     speed_mps = _rounded(np.hypot(*tracks.velocity_mps.T), 3)
     objects = [
-        TrackedObject(
+        messages.TrackedObject(
             track_id=track.id,
             class_=track.kind,
-            position=Position(x=track.x, y=track.y, distance=distance),
-            velocity=Velocity(x=track.vx, y=track.vy, speed=speed),
+            position=messages.Position(x=track.x, y=track.y, distance=distance),
+            velocity=messages.Velocity(x=track.vx, y=track.vy, speed=speed),
             history=_points(history.get(track.id, ())),
         )
         for track, distance, speed in zip(track_records(tracks), distance_m, speed_mps, strict=True)
     ]
-    return TracksMessage(
+    return messages.TracksMessage(
         timestamp=rfc3339(unix_s), frame_number=frame_number, state=state, objects=objects
     )
 
@@ -122,7 +106,7 @@ def state_message(
     config_hash: str,
     shown: ShownState | None = None,
     sentence: str | None = None,
-) -> StateMessage:
+) -> messages.StateMessage:
     """The state message: what the light shows since `since_unix_s` (seconds since 1970).
 
     `shown` and `sentence` replace the decision's own where the light says something else: FAULT
@@ -130,7 +114,7 @@ def state_message(
     """
     state = shown or _state(decision)
     pair = None if state in ("FAULT", "OFF") else decision.pair
-    return StateMessage(
+    return messages.StateMessage(
         state=state,
         since=rfc3339(since_unix_s),
         pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
@@ -149,15 +133,15 @@ def health_message(
     uptime_s: float,
     fps: float,
     latency_ms: Mapping[str, Mapping[str, float]],
-    camera: ComponentStatus,
+    camera: messages.ComponentStatus,
     capture_age_ms: float | None,
-    detector: ComponentStatus,
-    light: ComponentStatus,
+    detector: messages.ComponentStatus,
+    light: messages.ComponentStatus,
     faults: Sequence[Fault],
-    counters: Counters,
-) -> HealthMessage:
+    counters: messages.Counters,
+) -> messages.HealthMessage:
     """The health message at `unix_s`; `latency_ms` is what `StageTimes.percentiles` returns."""
-    return HealthMessage(
+    return messages.HealthMessage(
         timestamp=rfc3339(unix_s),
         state=state,
         version=version,
@@ -165,12 +149,12 @@ def health_message(
         uptime_s=_number(uptime_s, 1) or 0.0,
         fps=_number(fps, 2) or 0.0,
         latency_ms={
-            stage: StageLatency(
+            stage: messages.StageLatency(
                 **{key: _number(row[key], 2) or 0.0 for key in ("p50", "p95", "p99", "max")}
             )
             for stage, row in latency_ms.items()
         },
-        camera=CameraHealth(
+        camera=messages.CameraHealth(
             ok=camera.ok,
             detail=camera.detail,
             capture_age_ms=None if capture_age_ms is None else _number(capture_age_ms, 1),
@@ -207,7 +191,7 @@ def event_line(
         pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
         tracks=track_records(finite_tracks(tracks)),
         detections=[
-            EventDetection(kind=kind, confidence=confidence, box=tuple(box))
+            messages.EventDetection(kind=kind, confidence=confidence, box=tuple(box))
             for kind, confidence, box in zip(
                 _labels(detections.kind),
                 _rounded(detections.confidence, 4),

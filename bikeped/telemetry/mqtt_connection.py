@@ -61,7 +61,7 @@ class BrokerConnection:
         self._accepted = False
         self._published: set[int] = set()
         self._error: OSError | None = None
-        self._ended = False
+        self.lost = False  #: whether the connection has ended
         self._client = client = Client(
             CallbackAPIVersion.VERSION2, client_id, reconnect_on_failure=False
         )
@@ -75,11 +75,6 @@ class BrokerConnection:
             client.tls_set_context(credentials.tls)
         if will is not None:
             client.will_set(*will)
-
-    @property
-    def lost(self) -> bool:
-        """Whether the connection has ended."""
-        return self._ended
 
     def open(self) -> None:
         """Connects and waits until the broker has accepted the client. Raises OSError."""
@@ -111,8 +106,8 @@ class BrokerConnection:
 
     def _wait(self, done: Callable[[], bool], what: str) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: done() or self._ended, self._timeout_s)
-            if self._ended:
+            self._changed.wait_for(lambda: done() or self.lost, self._timeout_s)
+            if self.lost:
                 raise self._error or ConnectionResetError("the connection was closed")
             if not done():
                 raise TimeoutError(f"timed out waiting for the broker ({what})")
@@ -120,7 +115,7 @@ class BrokerConnection:
     def _end(self, error: OSError) -> None:
         with self._changed:
             self._error = self._error or error
-            self._ended = True
+            self.lost = True
             self._changed.notify_all()
         self._on_lost()
 
@@ -222,7 +217,7 @@ def _tls(config: MqttConfig, base_dir: Path) -> ssl.SSLContext:
         key_file = None if config.key_file is None else base_dir / config.key_file
         try:
             # An encrypted key would otherwise make OpenSSL prompt on the terminal.
-            context.load_cert_chain(cert_file, key_file, password=_no_password)
+            context.load_cert_chain(cert_file, key_file, password=lambda: "")
         except (OSError, ssl.SSLError) as exc:
             files = f"{cert_file}" if key_file is None else f"{cert_file}, {key_file}"
             raise TelemetryError(
@@ -230,10 +225,6 @@ def _tls(config: MqttConfig, base_dir: Path) -> ssl.SSLContext:
                 "give PEM files of a client certificate and its unencrypted key"
             ) from exc
     return context
-
-
-def _no_password() -> str:
-    return ""
 
 
 def _reason(exc: OSError) -> str:
