@@ -37,7 +37,6 @@ from bikeped.lab.rendering.random_scene import DEFAULT_MIX
 from bikeped.lab.training.augment import AugmentSettings, augment_data
 from bikeped.lab.training.coco import read_coco
 from bikeped.lab.training.crops import CropSettings
-from bikeped.lab.training.device import supports_bfloat16
 from bikeped.lab.training.drawn import DrawnSettings, draw_training_set
 from bikeped.lab.training.export import export_network
 from bikeped.lab.training.fit import FitSettings, fit
@@ -52,12 +51,17 @@ from bikeped.lab.training.model_card import (
 )
 from bikeped.lab.training.model_card_bootstrap import bootstrap_spread
 from bikeped.lab.training.model_card_text import render_card
-from bikeped.lab.training.network import SmallNet, multiply_adds, shift_scores
+from bikeped.lab.training.network import (
+    SmallDetector,
+    SmallNet,
+    load_weights,
+    multiply_adds,
+    shift_scores,
+)
 from bikeped.lab.training.packing import PackSettings
 from bikeped.lab.training.quantise import CALIBRATION_IMAGES, calibration_images, quantise
-from bikeped.lab.training.small import SmallTrainSettings, train_small
+from bikeped.lab.training.small import SmallTrainSettings, supports_bfloat16, train_small
 from bikeped.lab.training.warp import WarpRanges
-from bikeped.lab.training.weights import SmallDetector, load_weights
 from bikeped.models import BUNDLED_FILE
 from bikeped.types import Kind
 

@@ -13,7 +13,7 @@ from bikeped.cli.web_options import open_pages, print_address, web_option, web_o
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
-from bikeped.lab.cli.model_shared import report
+from bikeped.lab.cli.model import report
 
 SIZE = (1920, 1080)
 FPS = 30

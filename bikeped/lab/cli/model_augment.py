@@ -11,43 +11,25 @@ from rich.table import Table
 
 from bikeped.cli.common import FiniteRange, json_option, progress_bar, text_table
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.lab.cli.model_shared import data_argument, data_files, images_option, report
+from bikeped.lab.cli.model import data_argument, data_files, images_option, report
 
+#: Parameter of `WarpRanges`: help with the default range.
+_RANGES = {
+    "fov_deg": "Field of view of the image circle. Default: 170 210.",
+    "picture_fov_deg": "Field of view assumed for the ordinary picture's longer side. "
+    "Default: 90 150.",
+    "yaw_deg": "Yaw of the picture from the lens axis, right is positive. Default: -50 50.",
+    "pitch_deg": "Pitch of the picture from the lens axis, up is positive. Default: -40 15.",
+    "roll_deg": "Roll of the picture. Default: -10 10.",
+    "radius_share": "Radius of the image circle as a share of --size. Default: 0.42 0.55.",
+    "shift_share": "Offset of the circle's centre as a share of --size. Default: -0.04 0.04.",
+}
 F = TypeVar("F", bound=Callable[..., Any])
-#: Option, parameter of `WarpRanges`, help with the default range.
-_RANGES = (
-    ("--fov-deg", "fov_deg", "Field of view of the image circle. Default: 170 210."),
-    (
-        "--picture-fov-deg",
-        "picture_fov_deg",
-        "Field of view assumed for the ordinary picture's longer side. Default: 90 150.",
-    ),
-    (
-        "--yaw-deg",
-        "yaw_deg",
-        "Yaw of the picture from the lens axis, right is positive. Default: -50 50.",
-    ),
-    (
-        "--pitch-deg",
-        "pitch_deg",
-        "Pitch of the picture from the lens axis, up is positive. Default: -40 15.",
-    ),
-    ("--roll-deg", "roll_deg", "Roll of the picture. Default: -10 10."),
-    (
-        "--radius",
-        "radius_share",
-        "Radius of the image circle as a share of --size. Default: 0.42 0.55.",
-    ),
-    (
-        "--shift",
-        "shift_share",
-        "Offset of the circle's centre as a share of --size. Default: -0.04 0.04.",
-    ),
-)
 
 
 def _range_options(command: F) -> F:
-    for option, name, text in reversed(_RANGES):
+    for name, text in reversed(_RANGES.items()):
+        option = "--" + name.removesuffix("_share").replace("_", "-")
         command = click.option(option, name, nargs=2, type=float, metavar="MIN MAX", help=text)(
             command
         )

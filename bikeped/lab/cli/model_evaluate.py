@@ -12,7 +12,7 @@ from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.config import load_config
 from bikeped.errors import BikepedError, require
 from bikeped.lab.cli.conformance_shared import rich_table
-from bikeped.lab.cli.model_shared import data_argument, data_files, images_option, report
+from bikeped.lab.cli.model import PATH, data_argument, data_files, images_option, report
 
 if TYPE_CHECKING:
     from bikeped.lab.result_tables import CellValue, ResultTable
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 @click.option(
     "--curve",
     "curve_out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="Write the last MODEL's recall against area, as `conformance --recall-curve` reads it.",
 )
@@ -61,10 +61,7 @@ if TYPE_CHECKING:
     help="Merge a bin of the curve with fewer objects into the next.",
 )
 @click.option(
-    "--figure",
-    type=click.Path(path_type=Path),
-    metavar="FILE.png",
-    help="Draw the results as PNG, and as PDF beside it.",
+    "--figure", type=PATH, metavar="FILE.png", help="Draw the results as PNG, and as PDF beside it."
 )
 @json_option
 @guarded

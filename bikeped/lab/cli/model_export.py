@@ -11,11 +11,11 @@ import click
 from bikeped.cli.common import json_option
 from bikeped.cli.guard import guarded
 from bikeped.errors import DetectorError, require
-from bikeped.lab.cli.model_shared import picture_size, report
+from bikeped.lab.cli.model import PATH, picture_size, report
 
 
 @click.command("export")
-@click.argument("weights", type=click.Path(path_type=Path))
+@click.argument("weights", type=PATH)
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -42,7 +42,7 @@ from bikeped.lab.cli.model_shared import picture_size, report
 )
 @click.option(
     "--int8",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="DATA",
     help="Quantise the small network to eight bits, for a processor without a GPU. DATA: pictures "
     "in COCO's format to calibrate with.",

@@ -10,7 +10,7 @@ from bikeped.cli.common import json_option, progress_bar, write_json
 from bikeped.cli.guard import check_outputs, guarded
 from bikeped.errors import require
 from bikeped.files import make_folder
-from bikeped.lab.cli.model_shared import data_argument, data_files, images_option, report
+from bikeped.lab.cli.model import PATH, data_argument, data_files, images_option, report
 
 
 @click.command("train")
@@ -31,7 +31,7 @@ from bikeped.lab.cli.model_shared import data_argument, data_files, images_optio
 )
 @click.option(
     "--validation",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Data set to choose the best epoch by (a YOLO only). Default: a twentieth of DATA.",
 )
 @click.option(
@@ -43,7 +43,7 @@ from bikeped.lab.cli.model_shared import data_argument, data_files, images_optio
 )
 @click.option(
     "--weights",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Weight file to start from (a YOLO only). Default: train from scratch.",
 )
 @click.option("--epochs", type=click.IntRange(1, 10000), default=100, show_default=True)

@@ -15,7 +15,7 @@ from bikeped.cli.guard import check_outputs, guarded, written_paths
 from bikeped.config import LoadedConfig, load_config
 from bikeped.errors import BikepedError, GeometryError, ScenarioError
 from bikeped.files import write_whole
-from bikeped.lab.cli.model_shared import picture_size, report
+from bikeped.lab.cli.model import picture_size, report
 
 if TYPE_CHECKING:
     from bikeped.lab.rendering import DrawnObject, SceneCamera, ScenePainter

@@ -55,7 +55,7 @@ class FitSettings:
     seed: int = 0
     workers: int = 2  #: threads, each with a part of every step
     #: Convolutions of the packed steps in bfloat16: 0.8 of the time with hardware support, 6 times
-    #: the time without (`device.supports_bfloat16`). The loss and the plain steps are float32.
+    #: the time without (`small.supports_bfloat16`). The loss and the plain steps are float32.
     bfloat16: bool = False
     device: str = "cpu"
     crops: CropSettings = field(default_factory=CropSettings)

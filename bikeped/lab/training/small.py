@@ -9,14 +9,13 @@ from typing import Any
 
 import torch
 
+from bikeped.errors import DetectorError
 from bikeped.lab.training.coco import CocoData
 from bikeped.lab.training.crops import CropSettings
-from bikeped.lab.training.device import resolve_device, supports_bfloat16
-from bikeped.lab.training.export import export_network
+from bikeped.lab.training.export import export_network, training_record
 from bikeped.lab.training.fit import FitSettings, fit
 from bikeped.lab.training.hard_negative_mining import MiningSettings
-from bikeped.lab.training.onnx_file import training_record
-from bikeped.lab.training.weights import SmallDetector, save_weights
+from bikeped.lab.training.network import SmallDetector, save_weights
 
 
 @dataclass(frozen=True)
@@ -72,3 +71,29 @@ def train_small(
         "mistakes": fitted.mistakes,
         "losses": fitted.losses,
     }
+
+
+def resolve_device(asked: str) -> str:
+    """PyTorch's name of the device `auto`, `cpu`, or a GPU's number; DetectorError if unusable."""
+    if asked == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    device = f"cuda:{asked}" if asked.isdigit() else asked
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise DetectorError(
+            f"--device {asked}: cannot be used ({reason}); use cpu or auto"
+        ) from error
+    return device
+
+
+def supports_bfloat16(device: str) -> bool:
+    """Whether the device has bfloat16 hardware (of processors: AVX-512 BF16, AMX, Arm's BF16)."""
+    if torch.device(device).type == "cuda":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    try:
+        flags = set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+    except OSError:
+        return False
+    return bool(flags & {"avx512_bf16", "amx_bf16", "bf16"})

@@ -23,7 +23,7 @@ import yaml
 from bikeped.errors import DataSetError, DetectorError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.training.coco import CocoData, CocoImage, write_annotations
-from bikeped.lab.training.onnx_file import ExportSummary, training_record, write_onnx
+from bikeped.lab.training.export import ExportSummary, training_record, write_onnx
 
 _VALIDATION_SHARE = 20  #: one picture in this many, without a validation set
 _OPSET = 17

@@ -9,16 +9,16 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
 from bikeped.errors import DetectorError  # noqa: E402
-from bikeped.lab.training import device  # noqa: E402
+from bikeped.lab.training import small  # noqa: E402
 
 
 def test_auto_is_a_device_that_is_there():
-    assert device.resolve_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert small.resolve_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def test_a_device_that_is_not_there_is_one_line_with_the_mend():
     with pytest.raises(DetectorError, match=r"--device 99: cannot be used \(.*\); use cpu or auto"):
-        device.resolve_device("99")
+        small.resolve_device("99")
 
 
 @pytest.mark.parametrize(
@@ -34,10 +34,10 @@ def test_a_device_that_is_not_there_is_one_line_with_the_mend():
 def test_sixteen_bits_are_for_processors_that_multiply_them(monkeypatch, tmp_path, flags, known):
     listed = tmp_path / "cpuinfo"
     listed.write_text(f"processor : 0\n{flags}\n", encoding="ascii")
-    monkeypatch.setattr(device, "Path", lambda _: listed)
-    assert device.supports_bfloat16("cpu") is known
+    monkeypatch.setattr(small, "Path", lambda _: listed)
+    assert small.supports_bfloat16("cpu") is known
 
 
 def test_where_nothing_lists_the_processor_it_is_float32(monkeypatch, tmp_path):
-    monkeypatch.setattr(device, "Path", lambda _: Path(tmp_path) / "none")
-    assert device.supports_bfloat16("cpu") is False
+    monkeypatch.setattr(small, "Path", lambda _: Path(tmp_path) / "none")
+    assert small.supports_bfloat16("cpu") is False

@@ -18,8 +18,8 @@ from bikeped.lab.training.coco import read_coco, read_picture  # noqa: E402
 from bikeped.lab.training.crops import CropSettings  # noqa: E402
 from bikeped.lab.training.export import export_network, export_weights  # noqa: E402
 from bikeped.lab.training.fit import FitSettings, fit, learning_rate  # noqa: E402
+from bikeped.lab.training.network import SmallDetector, is_small, load_weights, save_weights  # noqa: E402
 from bikeped.lab.training.packing import PackSettings  # noqa: E402
-from bikeped.lab.training.weights import SmallDetector, is_small, load_weights, save_weights  # noqa: E402
 
 CROPS = CropSettings(view=(160, 96), window=(96, 64), light=0, cover=0)
 PACK = PackSettings(side=128, squares=2, pool=4)
@@ -196,9 +196,9 @@ def test_an_exported_file_is_what_the_detector_loads(fitted, tmp_path):
 
 
 def test_nothing_is_written_where_runtime_and_pytorch_disagree(fitted, tmp_path, monkeypatch):
-    from bikeped.lab.training import onnx_file
+    from bikeped.lab.training import export
 
-    monkeypatch.setattr(onnx_file, "_MOST_SCORE", -1.0)
+    monkeypatch.setattr(export, "_MOST_SCORE", -1.0)
     model = tmp_path / "model.onnx"
     with pytest.raises(DetectorError, match=r"model\.onnx: ONNX Runtime's answer differs"):
         export_network(SmallDetector(fitted.network, fitted.names, fitted.size), model)
