@@ -14,10 +14,8 @@ from bikeped.errors import BikepedError, require
 from bikeped.files import write_whole
 from bikeped.lab.cli.conformance_shared import (
     SuiteRun,
-    burst_option,
-    curve_option,
     experiment_options,
-    processes_option,
+    misses_options,
     rich_table,
     trials_option,
 )
@@ -120,10 +118,7 @@ def truth(run: SuiteRun) -> None:
 
 @command.command("montecarlo")
 @experiment_options
-@trials_option(50)
-@burst_option
-@curve_option
-@processes_option
+@misses_options
 def montecarlo(
     run: SuiteRun, trials: int, burst: float, curve_path: Path | None, processes: int
 ) -> None:
@@ -153,10 +148,7 @@ def montecarlo(
 @experiment_options
 @click.option("--loss", is_flag=True, help="With missed detections: fewer delays, random trials.")
 @click.option("--bursts", is_flag=True, help="With --loss: missed detections come in bursts.")
-@trials_option(50)
-@burst_option
-@curve_option
-@processes_option
+@misses_options
 def latency(
     run: SuiteRun,
     loss: bool,
@@ -265,10 +257,7 @@ def placement(run: SuiteRun, trials: int) -> None:
     show_default=True,
     help="Folder for data, tables, figures and report; finished experiments there are kept.",
 )
-@trials_option(50)
-@burst_option
-@curve_option
-@processes_option
+@misses_options
 @click.option("--no-figures", is_flag=True, help="Only data and tables.")
 def reproduce(
     run: SuiteRun,

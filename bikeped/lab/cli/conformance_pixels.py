@@ -57,7 +57,7 @@ def command(
     """
     from bikeped.lab.endtoend.ablation import run_ablation
     from bikeped.lab.endtoend.measures import collect_observations
-    from bikeped.lab.endtoend.report import DrawingSettings, end_to_end_result, verdict
+    from bikeped.lab.endtoend.report import draw_pixels, end_to_end_result, verdict
     from bikeped.lab.endtoend.run import run_all
     from bikeped.lab.experiments.deterministic import select_scenario
     from bikeped.lab.rendering import Conditions
@@ -80,12 +80,10 @@ def command(
     with progress_bar("scenarios", len(suite.scenarios)) as progress:
         runs = run_all(loaded, suite.scenarios, conditions, (width, height), processes, progress)
     steps = run_ablation(suite, runs, loaded, run.decision)
-    drawing = DrawingSettings(width, height, light, weather, place, run.seed)
+    drawing = {"width": width, "height": height, **vars(conditions)}
     observations = collect_observations(runs, suite.perception_results, loaded)
     result = end_to_end_result(suite, runs, steps, observations, drawing)
     if figures is not None:
-        from bikeped.lab.endtoend.report import draw_pixels
-
         draw_pixels(result.data, figures)
     run.emit(result)
     if run.json_path != "-":

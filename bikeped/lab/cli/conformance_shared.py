@@ -166,6 +166,11 @@ burst_option = click.option(
 )
 
 
+def misses_options(command: F) -> F:
+    """The options of random trials with missed detections."""
+    return trials_option(50)(burst_option(curve_option(processes_option(command))))
+
+
 def rich_table(table: ResultTable) -> RichTable:
     """A result's table for a terminal: per cent with one decimal, seconds with two."""
     text = [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]

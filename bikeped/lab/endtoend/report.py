@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,29 +29,17 @@ from bikeped.types import Kind
 GOAL = 0.03
 
 
-@dataclass(frozen=True)
-class DrawingSettings:
-    """How the scenarios were rendered, for the record."""
-
-    width: int
-    height: int
-    light: str
-    weather: str
-    place: int
-    seed: int
-
-
 def end_to_end_result(
     suite: Suite,
     runs: Sequence[EndToEndRun],
     steps: Sequence[AblationStep],
     seen: Observations,
-    drawing: DrawingSettings,
+    drawing: Mapping[str, Any],
 ) -> ExperimentResult:
-    """All results: `data` for JSON, and the tables for people."""
+    """All results: `data` for JSON, and the tables for people; `drawing`: how it was rendered."""
     scripted, whole = steps[0].metrics, steps[-1].metrics
     data: dict[str, Any] = {
-        "drawing": asdict(drawing),
+        "drawing": dict(drawing),
         "detector": runs[0].detector,
         "model_hash": runs[0].model_hash,
         "frames": seen.frames,

@@ -7,7 +7,6 @@ seed gives the same answer: one process, one generator.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,10 +101,23 @@ def optimize(
             trace.append([count, value])
         return value
 
-    found = _search(evaluate, seed, maxiter, popsize)
-    decision = decision_at(found, base)
-    metrics = suite.measure(decision)
-    before = suite.measure(base)
+    # Up to 1.14 the argument was named seed; a generator makes the same numbers under both names.
+    name = "rng" if tuple(map(int, scipy.__version__.split(".")[:2])) >= (1, 15) else "seed"
+    randomness: dict[str, Any] = {name: np.random.default_rng(seed)}
+    # Not polished: that takes derivatives, of a step function of whole numbers.
+    found: Any = differential_evolution(
+        evaluate,
+        Bounds([b.low for b in BOUNDS], [b.high for b in BOUNDS]),
+        strategy="best1bin",
+        maxiter=maxiter,
+        popsize=popsize,
+        tol=0.0,
+        integrality=[b.whole for b in BOUNDS],
+        polish=False,
+        **randomness,
+    )
+    decision = decision_at(np.asarray(found.x, np.float64), base)
+    metrics, before = suite.measure(decision), suite.measure(base)
     data = {
         "evaluations": count,
         "cost": cost(metrics),
@@ -160,27 +172,6 @@ def optimize(
 def evaluations(maxiter: int = MAXITER, popsize: int = POPSIZE) -> int:
     """How many evaluations a search makes."""
     return popsize * len(BOUNDS) * (maxiter + 1)
-
-
-def _search(
-    evaluate: Callable[[FloatArray], float], seed: int, maxiter: int, popsize: int
-) -> FloatArray:
-    # Up to 1.14 the argument was named seed; a generator makes the same numbers under both names.
-    name = "rng" if tuple(map(int, scipy.__version__.split(".")[:2])) >= (1, 15) else "seed"
-    randomness: dict[str, Any] = {name: np.random.default_rng(seed)}
-    # Not polished: that takes derivatives, of a step function of whole numbers.
-    found: Any = differential_evolution(
-        evaluate,
-        Bounds([b.low for b in BOUNDS], [b.high for b in BOUNDS]),
-        strategy="best1bin",
-        maxiter=maxiter,
-        popsize=popsize,
-        tol=0.0,
-        integrality=[b.whole for b in BOUNDS],
-        polish=False,
-        **randomness,
-    )
-    return np.asarray(found.x, np.float64)
 
 
 def candidate_yaml(result: ExperimentResult, suite_hash: str, config_hash: str) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
+from bikeped.lab.plotting import to_floats
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.simulation.metrics import GroundTruthFrames, Metrics, measure
@@ -262,12 +263,9 @@ def summarize_scenario(metrics: Sequence[Metrics], index: int) -> dict[str, Any]
 
 
 def _summarize_rows(rows: Sequence[Mapping[str, float | None]]) -> dict[str, Any]:
-    columns = {key: [row[key] for row in rows] for key in rows[0]}
     return {
-        key: summarize(
-            (np.nan if v is None else v for v in values), 1.0 if key in _SHARES else np.inf
-        )
-        for key, values in columns.items()
+        key: summarize(to_floats(row[key] for row in rows), 1.0 if key in _SHARES else np.inf)
+        for key in rows[0]
     }
 
 

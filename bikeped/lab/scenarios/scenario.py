@@ -97,13 +97,9 @@ class Scenario:
     source: str = ""
 
     @property
-    def last_waypoint_s(self) -> float:
-        return max(agent.end_s for agent in self.agents)
-
-    @property
     def duration_s(self) -> float:
         """Time of the last frame's bound: the last waypoint plus half a second."""
-        return self.last_waypoint_s + TAIL_S
+        return max(agent.end_s for agent in self.agents) + TAIL_S
 
     def frame_times(self, fps: float = 30.0) -> FloatArray:
         """Times i / fps that are at most `duration_s` (tolerating the last bit)."""

@@ -110,10 +110,6 @@ class Suite:
         return self._rule_inputs[0]
 
     @cached_property
-    def rule_input_without_error(self) -> RuleInput:
-        return self._rule_inputs[1]
-
-    @cached_property
     def _rule_inputs(self) -> tuple[RuleInput, RuleInput]:
         """With and without localisation error, in one pass of the tracker."""
         count = len(self.scenarios)
@@ -126,8 +122,7 @@ class Suite:
         self, decision: DecisionConfig, localisation_error: bool = True
     ) -> npt.NDArray[np.int8]:
         """State codes of every frame, scenario after scenario."""
-        run = self.rule_input if localisation_error else self.rule_input_without_error
-        return states(run, rule_settings(decision))
+        return states(self._rule_inputs[0 if localisation_error else 1], rule_settings(decision))
 
     def measure(self, decision: DecisionConfig, localisation_error: bool = True) -> Metrics:
         return measure(self.truth_frames, self.states(decision, localisation_error))

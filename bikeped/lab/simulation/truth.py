@@ -6,12 +6,14 @@ truth knows the future: each frame looks 5 s ahead along the scripted paths.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bikeped.lab.scenarios.scenario import Agent, Scenario
+from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind
 
 #: Distracted pedestrian's perception-reaction time, s (paper, section 4.5).
@@ -72,9 +74,6 @@ class GroundTruthSettings:
     ttc_bound_s: float | None = None
     braking: str | None = None
 
-    def braking_of(self, scenario: Scenario) -> BrakingProfile:
-        return BRAKING_PROFILES[self.braking or scenario.vehicle]
-
 
 @dataclass(frozen=True)
 class GroundTruth:
@@ -115,19 +114,11 @@ def compute_ground_truth(
     paths = {a.id: a.sample(grid_s)[0] for a in (*cyclists, *pedestrians)}
     best = _PairTruth.none(frames)
     nearest = np.full(frames, np.inf)
-    for cyclist in cyclists:
-        for pedestrian in pedestrians:
-            pair = _pair(
-                cyclist,
-                pedestrian,
-                paths[cyclist.id],
-                paths[pedestrian.id],
-                frames,
-                settings,
-                settings.braking_of(scenario),
-            )
-            best.replace_where_worse(pair)
-            nearest = np.fmin(nearest, pair.distance)
+    braking = BRAKING_PROFILES[settings.braking or scenario.vehicle]
+    for cyclist, pedestrian in itertools.product(cyclists, pedestrians):
+        pair = _pair(cyclist.id, pedestrian.id, paths, frames, settings, braking)
+        best.replace_where_worse(pair)
+        nearest = np.fmin(nearest, pair.distance)
     return GroundTruth(
         time_s=time_s,
         danger=best.danger,
@@ -179,17 +170,18 @@ class _PairTruth:
 
 
 def _pair(
-    cyclist: Agent,
-    pedestrian: Agent,
-    cyclist_xy: FloatArray,
-    pedestrian_xy: FloatArray,
+    cyclist: int,
+    pedestrian: int,
+    paths: Mapping[int, FloatArray],
     frames: int,
     settings: GroundTruthSettings,
     braking: BrakingProfile,
 ) -> _PairTruth:
     frame = _FRAME_STRIDE * np.arange(frames)
-    gap = cyclist_xy - pedestrian_xy
-    distance = np.sqrt((gap**2).sum(-1))  # NaN where either does not exist
+    cyclist_xy, pedestrian_xy = paths[cyclist], paths[pedestrian]
+    distance = np.sqrt(
+        ((cyclist_xy - pedestrian_xy) ** 2).sum(-1)
+    )  # NaN where either does not exist
     ahead_of = np.where(np.isnan(distance), np.inf, distance)
     # An agent exists in one interval: after its end the distance stays infinite.
     ahead = ahead_of[frame[:, None] + _SAMPLE_STRIDE * np.arange(_SAMPLES)]
@@ -232,8 +224,8 @@ def _pair(
         d_min=d_min,
         budget=budget,
         distance=now,
-        cyclist=np.full(frames, cyclist.id, np.int64),
-        pedestrian=np.full(frames, pedestrian.id, np.int64),
+        cyclist=np.full(frames, cyclist, np.int64),
+        pedestrian=np.full(frames, pedestrian, np.int64),
     )
 
 

@@ -16,7 +16,7 @@ from bikeped.lab.endtoend.measures import (
     localisation_rows,
     recall_rows,
 )
-from bikeped.lab.endtoend.report import DrawingSettings, end_to_end_result, verdict
+from bikeped.lab.endtoend.report import end_to_end_result, verdict
 from bikeped.lab.endtoend.run import EndToEndRun, run_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import Scenario, bundled_folder, load_scenarios
@@ -122,9 +122,7 @@ def test_an_eye_that_sees_nothing_is_named(
     assert "misses" in text
     assert "not within 3 points" in text
     seen = collect_observations([blind], suite.perception_results, loaded)
-    result = end_to_end_result(
-        suite, [blind], steps, seen, DrawingSettings(*SIZE, "day", "dry", 0, 0)
-    )
+    result = end_to_end_result(suite, [blind], steps, seen, {"light": "day"})
     assert result.data["goal"]["holds"] is False
     assert result.data["stages"][0]["name"] == "scripted"
     assert {t.name for t in result.tables} == {"stages", "scenarios", "recall", "localisation"}
