@@ -35,7 +35,6 @@ from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
 from bikeped.lab.simulation.truth import compute_ground_truth
-from bikeped.types import FloatArray
 
 FOOT_M = 0.3048
 WIDTHS_FT = (30, 40, 50, 60)
@@ -107,7 +106,7 @@ def fuse_cameras(
     visible_only: bool = False,
 ) -> DetectableObjects:
     """As `detectable_objects`, from each camera's perception (`seen`, at `poses`) of a scenario."""
-    rates = [_recall(s, recall, visible_only) for s in seen]
+    rates = [np.where((not visible_only) | (s.area_px2 > 0), s.recall(recall), 0.0) for s in seen]
     xy, area = seen[0].observed_m, seen[0].area_px2
     for pose, other in zip(poses[1:], seen[1:], strict=True):
         moved = poses[0].world_to_ground(pose.ground_to_world(other.observed_m))
@@ -116,11 +115,6 @@ def fuse_cameras(
         area = np.maximum(area, other.area_px2)
     missed = np.prod([1 - rate for rate in rates], axis=0)
     return DetectableObjects(name, xy, 1 - missed, seen[0].present, seen[0].kind)
-
-
-def _recall(seen: PerceptionResult, recall: RecallModel, visible_only: bool) -> FloatArray:
-    rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
-    return np.where(seen.area_px2 > 0, rate, 0.0) if visible_only else rate
 
 
 def _measure_views(

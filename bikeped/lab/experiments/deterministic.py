@@ -103,16 +103,9 @@ def run_table(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
         "the first ALERT to the closest approach",
     )
     total = ResultTable.of("run_totals", "All scenarios", [totals], METRIC_COLUMNS)
-    return ExperimentResult(
-        "run",
-        {
-            "decision": msgspec.to_builtins(decision),
-            "metrics": totals,
-            "scenarios": rows,
-            "budgets": budgets.data,
-        },
-        (table, total),
-    )
+    chosen = msgspec.to_builtins(decision)
+    data = {"decision": chosen, "metrics": totals, "scenarios": rows, "budgets": budgets.data}
+    return ExperimentResult("run", data, (table, total))
 
 
 def compare_table(
@@ -123,21 +116,15 @@ def compare_table(
 ) -> ExperimentResult:
     """All configurations, with and without localisation error."""
     data = compare_json(suite, compare(suite, configurations), loaded, seed)
-    tables = tuple(
-        ResultTable(
-            name,
-            title,
-            ("configuration", *METRIC_COLUMNS),
-            [(c, *cells(metrics, METRIC_COLUMNS)) for c, metrics in data[key].items()],
-        )
-        for name, title, key in (
-            ("compare", "Configurations, with localisation error", "configurations"),
-            (
-                "compare_without_error",
-                "Configurations, without localisation error",
-                "without_localisation_error",
-            ),
-        )
+
+    def table(name: str, key: str, error: str) -> ResultTable:
+        rows = [(c, *cells(metrics, METRIC_COLUMNS)) for c, metrics in data[key].items()]
+        title = f"Configurations, {error} localisation error"
+        return ResultTable(name, title, ("configuration", *METRIC_COLUMNS), rows)
+
+    tables = (
+        table("compare", "configurations", "with"),
+        table("compare_without_error", "without_localisation_error", "without"),
     )
     return ExperimentResult("compare", data, tables)
 
@@ -165,21 +152,10 @@ def localisation_errors(suite: Suite) -> ExperimentResult:
     distances = list(dict.fromkeys(float(row["distance_m"]) for row in table))
     error_m = {(r["kind"], r["bearing_deg"], r["distance_m"]): float(r["error_m"]) for r in table}
     lines = list(dict.fromkeys((str(r["kind"]), r["bearing_deg"]) for r in table))
-    return ExperimentResult(
-        "errors",
-        {"table": table, "map": maps},
-        (
-            ResultTable(
-                "errors",
-                "Localisation error, m",
-                ("kind", "bearing, degrees", *(f"{d:g} m" for d in distances)),
-                [
-                    (kind, bearing, *(round(error_m[kind, bearing, d], 2) for d in distances))
-                    for kind, bearing in lines
-                ],
-            ),
-        ),
-    )
+    columns = ("kind", "bearing, degrees", *(f"{d:g} m" for d in distances))
+    rows = [(k, b, *(round(error_m[k, b, d], 2) for d in distances)) for k, b in lines]
+    printed = ResultTable("errors", "Localisation error, m", columns, rows)
+    return ExperimentResult("errors", {"table": table, "map": maps}, (printed,))
 
 
 def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> ExperimentResult:

@@ -20,7 +20,6 @@ from bikeped.lab.experiments.trials import (
 )
 from bikeped.lab.process_pool import ProgressCallback, no_progress
 from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells
-from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.simulate import FPS, track
 from bikeped.lab.simulation.suite import Suite
@@ -56,10 +55,9 @@ def sweep(
         s for ms in delays_ms for s in suite.detection_sequences(delay_frames=delay_frames(ms))
     ]
     tracked = track(scenes)
-    truth: GroundTruthFrames = suite.truth_frames
     data: dict[str, Any] = {"delay_ms": list(delays_ms)}
     for name, order in PREDICTORS.items():
-        found = measure_repetitions(tracked, order, truth, {"": decision})[""]
+        found = measure_repetitions(tracked, order, suite.truth_frames, {"": decision})[""]
         rows = [metrics.as_dict() for metrics in found]
         data[name] = {figure: [row[figure] for row in rows] for figure in FIGURES}
     return ExperimentResult("latency", data, (_table(data, "latency", "Camera latency"),))

@@ -155,7 +155,7 @@ def run_experiment(
         write_whole(path, _json(document))
     drawn: list[Path] = []
     if figures:
-        from bikeped.lab.experiments.figures import draw_all
+        from bikeped.lab.experiments.report import draw_all
 
         drawn = draw_all({name: result.data}, suite, folder / "figures")
     return result, seconds, drawn

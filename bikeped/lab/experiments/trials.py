@@ -65,8 +65,9 @@ class DetectableObjects:
 
     @staticmethod
     def of(name: str, seen: PerceptionResult, recall: RecallModel) -> DetectableObjects:
-        rate = recall.recall(np.broadcast_to(seen.kind, seen.area_px2.shape), seen.area_px2)
-        return DetectableObjects(name, seen.observed_m, rate, seen.present, seen.kind)
+        return DetectableObjects(
+            name, seen.observed_m, seen.recall(recall), seen.present, seen.kind
+        )
 
     def trials(
         self, trials: Sequence[int], seed: int, burst: float | None

@@ -86,6 +86,10 @@ class PerceptionResult:
         """Localisation error [f, a]."""
         return np.asarray(np.sqrt(((self.observed_m - self.true_m) ** 2).sum(-1)))
 
+    def recall(self, model: RecallModel) -> FloatArray:
+        """Recall [f, a] of every object by the model."""
+        return model.recall(np.broadcast_to(self.kind, self.area_px2.shape), self.area_px2)
+
 
 def simulate_perception(
     scenario: Scenario, camera: GroundCamera, pose: CameraPose = SIMULATION_POSE

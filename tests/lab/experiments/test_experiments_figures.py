@@ -9,7 +9,7 @@ import pytest
 from bikeped.config import DecisionConfig, load_config
 from bikeped.errors import BikepedError
 from bikeped.lab.cli.conformance import command as conformance
-from bikeped.lab.experiments.figures import FIGURES, draw_all
+from bikeped.lab.experiments.report import FIGURES, draw_all
 from bikeped.lab.experiments.scenario_figures import draw_plan, draw_strip, spans
 from bikeped.lab.plotting import FigureSheet, file_stem
 from bikeped.lab.scenarios.scenario import parse_scenario
