@@ -10,6 +10,7 @@ import click
 import msgspec
 
 from bikeped.cli.common import (
+    PATH,
     FiniteRange,
     config_options,
     console,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @click.command("align")
-@click.argument("picture", metavar="FRAME", type=click.Path(path_type=Path))
+@click.argument("picture", metavar="FRAME", type=PATH)
 @config_options
 @click.option(
     "--at",
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 @click.option(
     "--points",
     "points_path",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Fit the marks of this file, which the page exports, without a browser.",
 )
 @click.option("--save", "write", is_flag=True, help="With --points: write the fitted keys into -c.")
@@ -75,6 +76,7 @@ def command(
     needs no browser, and ends with 1 when the marks do not agree with one another.
     """
     from bikeped.web.align_points import fit_json, fit_points, load_points
+    from bikeped.web.align_save import file_hash, save
 
     loaded = load_config(config_path, overrides)
     frame = _read_frame(picture, loaded, at_s)
@@ -91,7 +93,9 @@ def command(
         points = load_points(points_path)
         found, _ = fit_points(ground_camera(loaded), framing(loaded), points)
         if write:
-            saved = _save(loaded, found)
+            path = Path(loaded.source)
+            values = {key: getattr(found.alignment, key) for key in found.standard_errors}
+            saved = save(path, values, file_hash(path))
     if grid_path is not None:
         _draw(loaded, frame, found.alignment if found else None, points, grid_path)
     if found is not None:
@@ -159,14 +163,6 @@ def _draw(
         marks = tuple((mark.name, mark.u * share, mark.v * share) for mark in points.marks)
     drawn = cv2.cvtColor(draw_grid(rgb, grid, marks), cv2.COLOR_RGB2BGR)
     write_whole(target, cv2.imencode(target.suffix.lower(), drawn)[1].tobytes())
-
-
-def _save(loaded: LoadedConfig, found: AlignmentFit) -> Saved:
-    from bikeped.web.align_save import file_hash, save
-
-    path = Path(loaded.source)
-    values = {key: getattr(found.alignment, key) for key in found.standard_errors}
-    return save(path, values, file_hash(path))
 
 
 def _print(found: AlignmentFit, saved: Saved | None) -> None:

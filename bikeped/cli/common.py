@@ -1,4 +1,4 @@
-"""What all commands share: options, JSON output, tables, progress bar, log."""
+"""What all commands share: groups, options, JSON output, tables, progress bar, log."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 
 if TYPE_CHECKING:
@@ -23,6 +25,40 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+#: An option that names a file or a folder.
+PATH = click.Path(path_type=Path)
+_PLACE = re.compile(r"(?:(?P<host>\[[^\]]+\]|[^:\[\]]+):)?(?P<port>\d{1,5})")
+
+
+class LazyGroup(click.Group):
+    """A group of commands that live in modules of their own; its help page imports none of them.
+
+    `lazy` maps a command's name to (`package.module:name`, text for the group's help page), the
+    name `command` if left out. Commands that are added in the usual way are listed behind those.
+    """
+
+    def __init__(self, *args: Any, lazy: Mapping[str, tuple[str, str]], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.lazy = lazy
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return [*self.lazy, *super().list_commands(ctx)]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in self.lazy:
+            return super().get_command(ctx, cmd_name)
+        module, _, attribute = self.lazy[cmd_name][0].partition(":")
+        found: click.Command = getattr(import_module(module), attribute or "command")
+        return found
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        rows = [(name, text) for name, (_, text) in self.lazy.items()]
+        for name, command in sorted(self.commands.items()):
+            if not command.hidden:
+                rows.append((name, command.get_short_help_str(formatter.width)))
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 class FiniteRange(click.FloatRange):
@@ -37,30 +73,38 @@ class FiniteRange(click.FloatRange):
 
 def config_options(command: F) -> F:
     """`-c` and `--set`, on every command that reads a configuration."""
-    command = click.option(
-        "--set",
-        "overrides",
-        multiple=True,
-        metavar="SECTION.KEY=VALUE",
-        help="Override one key of the configuration; may be repeated.",
-    )(command)
-    return click.option(
-        "-c",
-        "--config",
-        "config_path",
-        type=click.Path(path_type=Path),
-        help="Configuration file; default: ./config.yaml, or the bundled one.",
-    )(command)
+    text = "Override one key of the configuration; may be repeated."
+    setting = click.option(
+        "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE", help=text
+    )
+    text = "Configuration file; default: ./config.yaml, or the bundled one."
+    return click.option("-c", "--config", "config_path", type=PATH, help=text)(setting(command))
 
 
 def json_option(command: F) -> F:
     """`--json FILE`, `-` for standard output."""
-    return click.option(
-        "--json",
-        "json_path",
-        metavar="FILE",
-        help="Write machine-readable JSON; - for standard output, and nothing else there.",
-    )(command)
+    text = "Write machine-readable JSON; - for standard output, and nothing else there."
+    return click.option("--json", "json_path", metavar="FILE", help=text)(command)
+
+
+def web_option(command: F) -> F:
+    """`--web [HOST:]PORT`: the live page of a replay while it runs, as `web_place`."""
+    text = "Serve the live page meanwhile, at the recording's frame rate; e.g. 8080."
+    return click.option("--web", "web_place", metavar="[HOST:]PORT", help=text)(command)
+
+
+def web_overrides(place: str) -> tuple[str, ...]:
+    """The value of `--web` as configuration overrides; BikepedError when it is no address."""
+    found = _PLACE.fullmatch(place.strip())
+    if found is None:
+        raise BikepedError(f"--web {place}: is not [HOST:]PORT; give e.g. 8080 or 127.0.0.1:8080")
+    host = (found["host"] or "127.0.0.1").strip("[]")
+    return ("web.enabled=true", f"web.host={host!r}", f"web.port={int(found['port'])}")
+
+
+def print_address(address: str) -> None:
+    """Prints on standard error where the page is."""
+    click.echo(f"{address} shows it while it runs", err=True)
 
 
 def write_json(data: Any, target: str) -> None:
@@ -68,8 +112,8 @@ def write_json(data: Any, target: str) -> None:
     text = json.dumps(data, indent=2, allow_nan=False) + "\n"
     if target == "-":
         sys.stdout.write(text)
-        return
-    write_whole(Path(target), text)
+    else:
+        write_whole(Path(target), text)
 
 
 def console(json_path: str | None = None) -> Console:
@@ -122,16 +166,11 @@ def progress_bar(what: str, total: int | None) -> Iterator[Callable[[int], None]
     if not screen.is_terminal:
         yield lambda done: None
         return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=screen, transient=True) as bar:
+    text, bar_column = progress.TextColumn("{task.description}"), progress.BarColumn()
+    columns = (text, bar_column, progress.MofNCompleteColumn(), progress.TimeRemainingColumn())
+    with progress.Progress(*columns, console=screen, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -82,8 +81,4 @@ def schema(config_path: Path | None, overrides: tuple[str, ...], json_path: str 
     """Print the JSON Schema of the configuration."""
     from bikeped.config.docs import json_schema
 
-    data = json_schema()
-    if json_path is not None and json_path != "-":
-        write_json(data, json_path)
-    else:
-        click.echo(json.dumps(data, indent=2))
+    write_json(json_schema(), json_path or "-")

@@ -45,8 +45,7 @@ def command(
         findings.append(Finding("configuration", "fail", str(error), "the other checks need it"))
     else:
         todo = checks(light=not no_light, sound=not no_sound)
-        screen = console("-")  # progress on standard error
-        with screen.status("checking") as status:
+        with console("-").status("checking") as status:  # on standard error
             for check, finding in zip(todo, run_checks(loaded, todo), strict=True):
                 findings.append(finding)
                 status.update(f"checking, {check.name} done")
@@ -67,12 +66,8 @@ def command(
 def _print(findings: list[Finding]) -> None:
     from rich.text import Text
 
-    rows = [
-        (
-            Text(finding.status, _STYLES[finding.status]),
-            finding.name,
-            finding.detail + (f"\n-> {finding.remedy}" if finding.remedy else ""),
-        )
-        for finding in findings
-    ]
+    rows = []
+    for f in findings:
+        remedy = f"\n-> {f.remedy}" if f.remedy else ""
+        rows.append((Text(f.status, _STYLES[f.status]), f.name, f.detail + remedy))
     console().print(text_table(("", "", ""), rows, align="lll"))

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 import click
 
 from bikeped import __version__
-from bikeped.cli.common import set_up_logging
-from bikeped.cli.lazy_group import LazyGroup
+from bikeped.cli.common import LazyGroup, set_up_logging
 from bikeped.errors import EXTRAS, BikepedError, MissingPackageError
 
 #: Every command: its module, and the text for the help page. The lab's are found by name, so that
 #: the device imports nothing of the lab.
 COMMANDS = {
-    "run": ("bikeped.cli.run", "Run the service: camera, tracking, decision, light and sound."),
-    "replay": ("bikeped.cli.replay", "Run a recorded video through the service's loop."),
+    "run": ("bikeped.cli.run:run", "Run the service: camera, tracking, decision, light and sound."),
+    "replay": ("bikeped.cli.run:replay", "Run a recorded video through the service's loop."),
     "demo": ("bikeped.lab.cli.demo", "Draw a crossing and run it through the loop."),
     "config": ("bikeped.cli.config", "Check, show or describe the configuration."),
     "doctor": ("bikeped.cli.doctor", "Check camera, model, light, speaker, broker, clock, disk."),
@@ -49,7 +47,7 @@ def cli(log_level: str) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command line; returns 0 (success), 1 (a check failed), 2 (bad input), 130 (^C)."""
     try:
-        result = _invoke(arguments)
+        result = cli.main(args=arguments, prog_name="bikeped", standalone_mode=False)
     except click.exceptions.Abort:
         click.echo("bikeped: interrupted", err=True)
         return 130
@@ -67,18 +65,13 @@ def main(arguments: list[str] | None = None) -> int:
     except BikepedError as error:
         click.echo(f"bikeped: {' '.join(str(error).split())}", err=True)
         return error.exit_status
-    return int(result or 0)
-
-
-def _invoke(arguments: list[str] | None) -> Any:
-    """Runs the command; MissingPackageError when it needs a package of an extra."""
-    try:
-        return cli.main(args=arguments, prog_name="bikeped", standalone_mode=False)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in EXTRAS:
             raise
-        raise MissingPackageError(package) from error
+        click.echo(f"bikeped: {MissingPackageError(package)}", err=True)
+        return BikepedError.exit_status
+    return int(result or 0)
 
 
 if __name__ == "__main__":

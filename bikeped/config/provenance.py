@@ -155,8 +155,9 @@ def check_provenance(loaded: LoadedConfig) -> ProvenanceCheck:
         )
     text = (
         f"decision promoted {found.promoted_at}, suite {found.suite_hash[:12]} "
-        f"({found.scenarios} scenarios), sensitivity {_percent(found, 'sensitivity')}, specificity "
-        f"{_percent(found, 'specificity')}, warning budget {_seconds(found)}"
+        f"({found.scenarios} scenarios), sensitivity {_figure(found, 'sensitivity', '{:.1%}')}, "
+        f"specificity {_figure(found, 'specificity', '{:.1%}')}, "
+        f"warning budget {_figure(found, 'mean_warning_budget_s', '{:.2f} s')}"
     )
     if None in (found.tracking_hash, found.latency_hash, found.detector_hash):
         return ProvenanceCheck(
@@ -176,11 +177,6 @@ def check_provenance(loaded: LoadedConfig) -> ProvenanceCheck:
     return ProvenanceCheck(not changed, text)
 
 
-def _percent(found: Provenance, key: str) -> str:
+def _figure(found: Provenance, key: str, form: str) -> str:
     value = found.metrics.get(key)
-    return "unknown" if value is None else f"{100 * value:.1f} %"
-
-
-def _seconds(found: Provenance) -> str:
-    value = found.metrics.get("mean_warning_budget_s")
-    return "unknown" if value is None else f"{value:.2f} s"
+    return "unknown" if value is None else form.format(value)

@@ -137,6 +137,6 @@ def test_an_interrupt_ends_with_130(monkeypatch, capsys, small_config, make_clip
     def interrupted(*a, **k):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bikeped.cli.replay.load_config", interrupted)
+    monkeypatch.setattr("bikeped.cli.run.load_config", interrupted)
     assert main(["replay", "x.avi"]) == 130
     assert "interrupted" in capsys.readouterr().err

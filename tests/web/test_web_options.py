@@ -6,8 +6,8 @@ import re
 
 import pytest
 
+from bikeped.cli.common import web_overrides
 from bikeped.cli.main import main
-from bikeped.cli.web_options import web_overrides
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
 

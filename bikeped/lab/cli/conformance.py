@@ -7,8 +7,7 @@ from pathlib import Path
 import click
 from rich.markup import escape
 
-from bikeped.cli.common import progress_bar
-from bikeped.cli.lazy_group import LazyGroup
+from bikeped.cli.common import LazyGroup, progress_bar
 from bikeped.config import load_decision
 from bikeped.errors import BikepedError, require
 from bikeped.files import write_whole

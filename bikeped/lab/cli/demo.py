@@ -7,9 +7,17 @@ from pathlib import Path
 
 import click
 
-from bikeped.cli.common import FiniteRange, config_options, json_option, progress_bar, write_json
+from bikeped.cli.common import (
+    FiniteRange,
+    config_options,
+    json_option,
+    print_address,
+    progress_bar,
+    web_option,
+    web_overrides,
+    write_json,
+)
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.cli.web_options import open_pages, print_address, web_option, web_overrides
 from bikeped.config import load_config
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
@@ -59,7 +67,11 @@ def command(
     loaded = load_config(config_path, overrides)
     if loaded.config.detection.model is None:
         loaded = load_config(config_path, (f"detection.model={BUNDLED}", *overrides))
-    pages = None if web_place is None else open_pages(loaded)
+    pages = None
+    if web_place is not None:
+        from bikeped.web.service_pages import ServicePages
+
+        pages = ServicePages(loaded)
     clip, events, overlay = out / "crossing.avi", out / "events.jsonl", out / "overlay.mp4"
     names = [clip, sidecar_path(clip), events, overlay, out / "summary.txt", out / "summary.json"]
     if pages is not None and (refused := port_error(loaded.config.web)) is not None:

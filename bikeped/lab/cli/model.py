@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from bikeped.cli.common import console, width_height, write_json
-from bikeped.cli.lazy_group import LazyGroup
+from bikeped.cli.common import LazyGroup, console, width_height, write_json
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:
