@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.markup import escape
 
 from bikeped.cli.common import LazyGroup, console, width_height, write_json
 from bikeped.errors import BikepedError
@@ -69,6 +68,8 @@ def report(summary: dict[str, Any], json_path: str | None, shown: Iterable[str |
     if json_path is not None:
         write_json(summary, json_path)
     if json_path != "-":
+        from rich.markup import escape
+
         screen = console()
         for part in shown:
             screen.print(escape(part) if isinstance(part, str) else part)
