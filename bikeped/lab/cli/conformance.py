@@ -128,7 +128,7 @@ def montecarlo(
     """
     require("scipy")
     from bikeped.lab.experiments import trials as mc
-    from bikeped.lab.simulation.perception import load_recall_curve
+    from bikeped.lab.simulation.perception import load_recall_curve, recall_models
     from bikeped.lab.simulation.suite import CONFIGURATIONS
 
     curve = None if curve_path is None else load_recall_curve(curve_path)
@@ -136,7 +136,8 @@ def montecarlo(
     if run.decision not in configurations.values():
         configurations = {"configured": run.decision, **configurations}
     suite = run.suite
-    with progress_bar("trials", mc.montecarlo_jobs(trials, curve is not None)) as progress:
+    jobs = mc.trial_jobs(2 * len(recall_models(curve)), trials)
+    with progress_bar("trials", jobs) as progress:
         result = mc.montecarlo(
             suite, configurations, trials, run.seed, burst, curve, processes, progress
         )

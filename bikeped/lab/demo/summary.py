@@ -30,18 +30,14 @@ def summarise(events: Sequence[Event], scenario: str = "") -> dict[str, Any]:
     """
     frames = [event for event in events if "state" in event and "t" in event]
     count = len(frames)
-    shares = {
-        name: (sum(event["state"] == name for event in frames) / count if count else 0.0)
-        for name in _STATES
-    }
+    states = [str(event["state"]) for event in frames]
     alerts = [_alert(frames, first, until) for first, until in _onsets(frames)]
-    order = [str(frames[first]["state"]) for first, _ in runs([e["state"] for e in frames])]
     return {
         "scenario": scenario,
         "frames": count,
         "duration_s": round(float(frames[-1]["t"] - frames[0]["t"]), 3) if count else 0.0,
-        "state_share": {name: round(share, 4) for name, share in shares.items()},
-        "state_order": order,
+        "state_share": {s: round(states.count(s) / max(count, 1), 4) for s in _STATES},
+        "state_order": [states[first] for first, _ in runs(states)],
         "alerts": alerts,
     }
 

@@ -321,11 +321,6 @@ def montecarlo(
     return ExperimentResult("montecarlo", data, tuple(_tables(data)))
 
 
-def montecarlo_jobs(trials: int, curve: bool) -> int:
-    """How far the progress of `montecarlo` counts."""
-    return trial_jobs(6 if curve else 4, trials)
-
-
 def _tables(data: Mapping[str, Any]) -> Iterator[ResultTable]:
     columns = {
         "sens, %": "metrics.sensitivity.mean",
