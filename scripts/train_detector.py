@@ -33,7 +33,7 @@ from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.base import sha256_of
 from bikeped.files import make_folder, write_whole
-from bikeped.lab.rendering.random_scene import DEFAULT_MIX
+from bikeped.lab.rendering.dataset import DEFAULT_MIX
 from bikeped.lab.training.augment import AugmentSettings, augment_data
 from bikeped.lab.training.coco import read_coco
 from bikeped.lab.training.crops import CropSettings
@@ -43,14 +43,14 @@ from bikeped.lab.training.fit import FitSettings, fit
 from bikeped.lab.training.hard_negative_mining import MINING_ROUNDS, MiningSettings
 from bikeped.lab.training.model_card import (
     DrawnTest,
+    bootstrap_spread,
     choose_confidence,
     drawn_test,
+    render_card,
     summary,
     summary_by_light,
     sweep,
 )
-from bikeped.lab.training.model_card_bootstrap import bootstrap_spread
-from bikeped.lab.training.model_card_text import render_card
 from bikeped.lab.training.network import (
     SmallDetector,
     SmallNet,

@@ -21,7 +21,7 @@ from onnx import TensorProto, helper, numpy_helper
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
 
-from bikeped.lab.rendering.avi_writer import AviWriter
+from bikeped.lab.rendering.clip import AviWriter
 
 #: `serve`, `open_page` and a headless Chromium, for the pages of device and lab.
 pytest_plugins = ["browser_fixtures"]

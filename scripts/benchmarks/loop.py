@@ -19,8 +19,7 @@ from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.lab.demo.summary import bundled_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
-from bikeped.lab.rendering.avi_writer import AviWriter
-from bikeped.lab.rendering.clip import encode_jpeg
+from bikeped.lab.rendering.clip import AviWriter, encode_jpeg
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.models import BUNDLED_FILE
 from bikeped.pipeline.replay import ReplayResult, replay

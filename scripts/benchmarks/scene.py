@@ -8,7 +8,7 @@ from benchmarks.figures import Figures, in_turns
 from bikeped.config import load_config
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter, scene_camera
 from bikeped.lab.rendering.backdrop import backdrop
-from bikeped.lab.rendering.random_scene import random_scenario
+from bikeped.lab.rendering.dataset import random_scenario
 from bikeped.lab.rendering.render_camera import rays
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 

@@ -15,7 +15,7 @@ from bikeped.detection import load_detector
 from bikeped.detection.base import sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
-from bikeped.lab.training.model_card_text import meets_target, render_card
+from bikeped.lab.training.model_card import meets_target, render_card
 from bikeped.models import BUNDLED, BUNDLED_FILE, BUNDLED_INT8_FILE, NOT_FOR_STREETS, model_file
 from bikeped.pipeline.doctor import check_model
 from bikeped.types import Kind

@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 
 from bikeped.lab.rendering.backdrop import FixtureSprite, backdrop
-from bikeped.lab.rendering.compositing import add_glow, contact_shadow, darken, paste_sprite
+from bikeped.lab.rendering.compositing import (
+    Weather,
+    add_glow,
+    contact_shadow,
+    darken,
+    paste_sprite,
+)
 from bikeped.lab.rendering.conditions import Conditions
 from bikeped.lab.rendering.furniture import FOOTPRINT_M, POLE_FOOTPRINT_M
 from bikeped.lab.rendering.labels import DrawnObject, Occluder, label
@@ -18,7 +24,6 @@ from bikeped.lab.rendering.render_camera import SceneCamera
 from bikeped.lab.rendering.riders import rider
 from bikeped.lab.rendering.sprite import Sprite, rasterise, shadow, sprites_overlap
 from bikeped.lab.rendering.vehicles import vehicle
-from bikeped.lab.rendering.weather import Weather
 from bikeped.lab.scenarios.scenario import Agent, Scenario
 from bikeped.types import FloatArray, ImageArray
 

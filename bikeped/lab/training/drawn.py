@@ -21,8 +21,7 @@ from bikeped.files import make_folder
 from bikeped.geometry import CameraPose
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import SceneCamera, scene_camera
-from bikeped.lab.rendering.dataset import write_dataset
-from bikeped.lab.rendering.random_scene import SceneMix
+from bikeped.lab.rendering.dataset import SceneMix, write_dataset
 from bikeped.lab.rendering.render_camera import DEFAULT_POSE
 from bikeped.lab.training.coco import write_annotations
 

@@ -5,10 +5,9 @@ The same network outputs are evaluated in three ways:
 `classes`     the network's own classes against the data's, matched by name: COCO's usual measures.
 `merged`      classes merged to pedestrian, cyclist and vehicle by the names in `detection`, as in
               the paper's table: a bicycle is a bicycle's box, and its rider a person.
-`road_users`  as deployed, at the configured confidence and suppression, with riders joined to their
-              cycles. The ground truth is joined by the same rule (`detection/riders.py`): a person
-              on a bicycle and the bicycle are one cyclist, whose box holds both. Data with whole
-              cyclists (`cyclist`) are used as they are.
+`road_users`  as deployed, at the configured confidence and suppression, riders joined to their
+              cycles by `detection/person_boxes.py`, in the ground truth too: one cyclist, whose
+              box holds both. Data with whole cyclists (`cyclist`) are used as they are.
 
 The simulation's recall curve is that of `road_users`, for its objects are road users.
 
@@ -37,21 +36,19 @@ from bikeped.detection.output_layouts import Candidates
 from bikeped.errors import DataSetError, require
 from bikeped.files import write_whole
 from bikeped.lab.training.coco import CocoData, read_picture
-from bikeped.lab.training.ground_truth import (
-    INPUT_PX,
-    category_truth,
-    kinds_by_name,
-    plain_name,
-    road_user_truth,
-)
 from bikeped.lab.training.measures import (
+    INPUT_PX,
     DetectionSet,
     GroundTruth,
     Measures,
     RecallCurve,
+    category_truth,
+    kinds_by_name,
     measure,
+    plain_name,
     recall_by_distance,
     recall_curve,
+    road_user_truth,
 )
 from bikeped.types import Detections, Kind
 

@@ -1,12 +1,13 @@
-"""Tests a model on drawn streets outside its training: the figures of its card.
+"""Tests a model on drawn streets outside its training: its model card.
 
 Pictures are drawn from other seeds, places and lights than the training's, encoded and decoded as
-the camera's are, and go through the service's `load_detector`.
+the camera's are, and go through the service's `load_detector`. The card's text is in
+templates/model_card.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -24,8 +25,9 @@ from bikeped.geometry import road_region
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, scene_camera
 from bikeped.lab.rendering.clip import encode_jpeg
-from bikeped.lab.rendering.dataset import pictures
-from bikeped.types import Detections, Kind, Region
+from bikeped.lab.rendering.dataset import PICTURES_A_STREET, pictures
+from bikeped.templates import render
+from bikeped.types import Detections, FloatArray, Kind, Region
 
 #: Bounds of the distance rings, metres along the ground from below the lens.
 RINGS_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0)
@@ -44,6 +46,11 @@ WARNED = (Kind.PEDESTRIAN, Kind.CYCLIST)  #: kinds that cause warnings
 _EXTRA = ("false", "loose", "another_kind")
 _QUALITY = 88
 _FAR = 35.0
+_Picture = tuple[bytes, list[DrawnObject], SceneCamera, Conditions]
+_DRAWS = 2000
+_LOW, _HIGH = 2.5, 97.5  #: percentiles
+TARGET_RECALL, TARGET_FALSE = 0.95, 1.0  #: within 15 m; per 100 frames
+_UNTRAINED_AP = 0.2  #: a lower average precision of all road users says little
 
 
 @dataclass(frozen=True)
@@ -197,9 +204,6 @@ def _numbers(
     }
 
 
-_Picture = tuple[bytes, list[DrawnObject], SceneCamera, Conditions]
-
-
 def _drawn(loaded: LoadedConfig, test: DrawnTest) -> Iterator[_Picture]:
     parts = -(-test.pictures // test.part)
     sizes = [min(test.part, test.pictures - i * test.part) for i in range(parts)]
@@ -276,3 +280,67 @@ def match_detections(
             )
         )
     return rows
+
+
+def bootstrap_spread(
+    seen: Records, confidence: float, a_street: int = PICTURES_A_STREET
+) -> dict[str, Any]:
+    """95 % intervals of the recalls of pedestrians and cyclists within 15 m, and of the false
+    positives of both per 100 frames.
+
+    Streets are resampled with replacement (Efron and Tibshirani 1993, "An introduction to the
+    bootstrap", section 13.3, percentiles), not pictures, for the `a_street` consecutive pictures of
+    one street are alike. A recall without objects is None. Deterministic.
+    """
+    counts = np.array([_counts(picture, confidence) for picture in seen], np.float64)
+    streets = np.add.reduceat(counts, np.arange(0, len(counts), a_street), axis=0)
+    random = np.random.default_rng(0)
+    drawn = random.integers(len(streets), size=(_DRAWS, len(streets)))
+    sums = np.stack([streets[picks].sum(axis=0) for picks in drawn])
+    result: dict[str, Any] = {
+        "false_pedestrian_or_cyclist_per_100_frames": _bounds(100 * sums[:, -2] / sums[:, -1], 3)
+    }
+    for number, kind in enumerate(WARNED):
+        found, asked = sums[:, 2 * number], sums[:, 2 * number + 1]
+        some = asked > 0
+        result[kind.label] = _bounds(found[some] / asked[some], 4) if some.any() else None
+    return result
+
+
+def _counts(picture: Sequence[DetectionRecord], confidence: float) -> list[int]:
+    """Found objects and objects of each kind, false positives, and 1 for the frame."""
+    row = []
+    for kind in WARNED:
+        mine = [s for s in picture if s.kind == kind and s.distance_m < NEAR_M]
+        row += [sum(s.found_at(confidence) for s in mine), len(mine)]
+    false = [s for s in picture if s.kind in WARNED and s.extra == "false"]
+    return [*row, sum(s.confidence >= confidence for s in false), 1]
+
+
+def _bounds(values: FloatArray, digits: int) -> list[float]:
+    return [round(float(v), digits) for v in np.percentile(values, [_LOW, _HIGH])]
+
+
+def render_card(card: Mapping[str, Any]) -> str:
+    """Markdown; `card` is what `scripts/train-detector` writes into small.json."""
+    values: dict[str, Any] = {"reached": meets_target(card["configured_camera"])}
+    if "experiment" in card:
+        runs = [card["experiment"][name]["road_users"] for name in ("ordinary", "augmented")]
+        both = zip(*(run["rows"] for run in runs), strict=True)
+        values["pairs"] = [(one["name"], one, other) for one, other in both]
+        values["undertrained"] = max(run["all"]["ap"] or 0.0 for run in runs) < _UNTRAINED_AP
+    return render(
+        "model_card.md",
+        Path(__file__).parent / "templates",
+        target_recall=TARGET_RECALL,
+        target_false=TARGET_FALSE,
+        **values,
+        **card,
+    )
+
+
+def meets_target(test: Mapping[str, Any]) -> bool:
+    """Whether the figures of one test of the card are as good as the targets."""
+    recalls = (test["kinds"][kind.label]["within_15_m"]["recall"] for kind in WARNED)
+    false = test["false_pedestrian_or_cyclist_per_100_frames"]
+    return bool(min(recalls) >= TARGET_RECALL and false <= TARGET_FALSE)

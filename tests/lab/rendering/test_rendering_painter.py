@@ -16,7 +16,7 @@ from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter, scene_c
 from bikeped.lab.rendering.backdrop import backdrop
 from bikeped.lab.rendering.compositing import paste_sprite
 from bikeped.lab.rendering.conditions import LIGHTS, random_conditions
-from bikeped.lab.rendering.random_scene import SceneMix, random_camera, random_scenario
+from bikeped.lab.rendering.dataset import SceneMix, random_camera, random_scenario
 from bikeped.lab.rendering.render_camera import lens_camera, rays, rectilinear_camera
 from bikeped.lab.rendering.sprite import Sprite
 from bikeped.lab.rendering.street_layout import street_layout

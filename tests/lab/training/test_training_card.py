@@ -13,6 +13,7 @@ from bikeped.lab.rendering import DrawnObject, scene_camera
 from bikeped.lab.training.model_card import (
     DetectionRecord,
     DrawnTest,
+    bootstrap_spread,
     choose_confidence,
     drawn_test,
     match_detections,
@@ -20,7 +21,6 @@ from bikeped.lab.training.model_card import (
     summary_by_light,
     sweep,
 )
-from bikeped.lab.training.model_card_bootstrap import bootstrap_spread
 from bikeped.models import BUNDLED_FILE
 from bikeped.types import Detections, Kind
 

@@ -20,7 +20,7 @@ from bikeped.lab.simulation.perception import AREA_SCALE
 from bikeped.lab.training.coco import read_coco
 from bikeped.lab.training.evaluate import EvaluationSettings, ModelUnderTest, evaluate, load_models
 from bikeped.lab.training.evaluation_figures import draw_evaluation, evaluation_rows
-from bikeped.lab.training.ground_truth import INPUT_PX
+from bikeped.lab.training.measures import INPUT_PX
 
 CPU = DetectionConfig(providers=("cpu",), threads=1)
 ONE = EvaluationSettings(least_objects=1)

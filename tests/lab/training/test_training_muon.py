@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
-from bikeped.lab.training.muon import Muon, orthogonal  # noqa: E402
+from bikeped.lab.training.fit import Muon, orthogonal  # noqa: E402
 
 
 @pytest.mark.parametrize("shape", [(16, 27), (64, 64), (96, 12)])
