@@ -146,31 +146,29 @@ def command(
     if report_path is not None:
         require("matplotlib", extra="calibrate")
     _check_outputs(images, config_path, out or _DEFAULT_OUT, report_path, json_path)
-    from bikeped.lab.cli.calibrate_run import (
-        CalibrateOptions,
-        camera_config,
-        images_of,
-        live_pictures,
-        print_result,
-        run,
-        write_outputs,
-    )
+    from bikeped.lab.calibration.capture.images import load_images
+    from bikeped.lab.cli import calibrate_run as work
 
     number = None if terms is None else int(terms)
-    options = CalibrateOptions(board, model, number, board_shape, compare, folds or 0)
+    options = work.CalibrateOptions(board, model, number, board_shape, compare, folds or 0)
     try:
-        loaded = camera_config(config_path, overrides)
+        loaded = work.camera_config(config_path, overrides)
         if live:
-            images = live_pictures(images, board, loaded, screen)
-        pictures = images_of(images)
-        result = run(pictures, options, loaded)
-        written = write_outputs(result, pictures, report_path, json_path, out, _DEFAULT_OUT)
+            images = work.live_pictures(images, board, loaded, screen)
+        if not images:
+            raise BikepedError(
+                "IMAGES: missing; name pictures of the board, a folder of them or a video, or use "
+                "--live"
+            )
+        pictures = load_images(images)
+        result = work.run(pictures, options, loaded)
+        written = work.write_outputs(result, pictures, report_path, json_path, out, _DEFAULT_OUT)
     except KeyboardInterrupt:
         click.echo("bikeped: interrupted", err=True)
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # another Ctrl-C ends it without a trace
         raise click.exceptions.Exit(130) from None
     if json_path != "-":
-        print_result(screen, result, compare)
+        work.print_result(screen, result, compare)
         for line in written:
             click.echo(line)
     return 0

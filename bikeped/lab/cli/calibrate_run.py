@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +23,8 @@ from bikeped.geometry import canonical_projection
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.capture.coverage import measure_coverage
 from bikeped.lab.calibration.capture.guide import CaptureGuide
-from bikeped.lab.calibration.capture.images import CalibrationImage, load_images
-from bikeped.lab.calibration.capture.live_session import LivePage, LiveSession, capture_boards
+from bikeped.lab.calibration.capture.images import CalibrationImage
+from bikeped.lab.calibration.capture.live_session import LiveSession, capture_boards, live_page
 from bikeped.lab.calibration.corners.candidates import assumed_lens
 from bikeped.lab.calibration.image_pipeline import detect_boards
 from bikeped.lab.calibration.report.field_of_view import (
@@ -50,6 +51,8 @@ from bikeped.lab.calibration.solver.model_comparison import (
 from bikeped.lab.calibration.solver.observations import prepare_observations
 
 DEFAULT_FOLDER = Path("calibration-pictures")
+_CIRCLE_IMAGES = 16  # enough to see the image circle
+_MOST_NAMED = 8
 
 
 def live_pictures(
@@ -68,22 +71,16 @@ def live_pictures(
     lens, centre = assumed_lens(camera.width, camera.height)
     guide = CaptureGuide(pattern, camera.width, camera.height, lens, centre)
     session = LiveSession(guide)
-    source = open_source(camera)
-    try:
-        with LivePage(session, port=loaded.config.web.port) as page:
-            screen.print(f"pictures go into {escape(str(folder))}; Ctrl-C when you have enough")
-            screen.print(f"open {page.url}" if page.url else f"no page: {page.error}")
-            try:
-                capture_boards(source, guide, folder, session, say=lambda line: screen.print(line))
-            except KeyboardInterrupt:
-                session.stop()
-                click.echo("bikeped: interrupted; calibrating from what was kept", err=True)
-    finally:
-        source.close()
+    page = live_page(session, port=loaded.config.web.port)
+    with contextlib.closing(open_source(camera)) as source, page as (url, error):
+        screen.print(f"pictures go into {escape(str(folder))}; Ctrl-C when you have enough")
+        screen.print(f"open {url}" if url else f"no page: {error}")
+        try:
+            capture_boards(source, guide, folder, session, say=screen.print)
+        except KeyboardInterrupt:
+            session.stop()
+            click.echo("bikeped: interrupted; calibrating from what was kept", err=True)
     return (folder,)
-
-
-_CIRCLE_IMAGES = 16  # enough to see the image circle
 
 
 @dataclass(frozen=True)
@@ -96,12 +93,6 @@ class CalibrateOptions:
     board_shape: bool
     compare: bool
     folds: int  #: 0: each image is a fold
-
-    @property
-    def writes_recommended(self) -> bool:
-        """Whether the recommended model is written."""
-        open_model = self.model is None and self.terms is None and not self.board_shape
-        return self.compare and open_model
 
 
 def run(
@@ -121,7 +112,9 @@ def run(
     with progress_bar("models", len(models)) as progress:
         comparison = fit_models(prepared, models, options.folds, progress)
     recommendation = recommend_model(comparison)
-    chosen = comparison.fits[recommendation.name if options.writes_recommended else model.name]
+    named = options.model is not None or options.terms is not None or options.board_shape
+    recommended = options.compare and not named
+    chosen = comparison.fits[recommendation.name if recommended else model.name]
     some = images[:: max(1, len(images) // _CIRCLE_IMAGES)][:_CIRCLE_IMAGES]
     bright = brightest_pixels(image.grey() for image in some)
     offset = (0, 0) if framed is None else framed.offset_px
@@ -154,7 +147,11 @@ def write_outputs(
     """Writes all outputs, computed before the first is written; one line about each."""
     prepared = result.comparison.prepared
     lens = calibration_data(prepared, result.chosen, result.field, result.framing)
-    page = "" if report is None else _report(result, images)
+    page = ""
+    if report is not None:
+        from bikeped.lab.calibration.report.html_report import report_page
+
+        page = report_page(result, images)
     lines = []
     if report is not None:
         write_whole(report, page)
@@ -169,23 +166,6 @@ def write_outputs(
         return [*lines, text]
     kept = write_calibration(target, lens)
     return [*lines, f"wrote {target}" + (f"; the former one is {kept}" if kept else "")]
-
-
-def _report(result: CalibrationResult, images: Sequence[CalibrationImage]) -> str:
-    from bikeped.lab.calibration.report.html_report import Thumbnail, report_page
-
-    offset = (0, 0) if result.framing is None else result.framing.offset_px
-    return report_page(result, [Thumbnail(image.name, image.grey(), offset) for image in images])
-
-
-def images_of(paths: Sequence[Path]) -> list[CalibrationImage]:
-    """The images of the command line; BikepedError where none are named."""
-    if not paths:
-        raise BikepedError(
-            "IMAGES: missing; name pictures of the board, a folder of them or a video, or use "
-            "--live"
-        )
-    return load_images(paths)
 
 
 def camera_config(config_path: Path | None, overrides: tuple[str, ...]) -> LoadedConfig:
@@ -214,36 +194,25 @@ def _configuration_cautions(loaded: LoadedConfig, size: tuple[int, int], framed:
     return [f"{loaded.source} sets {given}, {override}"] if given else []
 
 
-_MOST_NAMED = 8
-
-
 def print_result(screen: Console, result: CalibrationResult, compare: bool) -> None:
     """Boards, models, the recommendation, and cautions."""
     prepared, chosen = result.comparison.prepared, result.chosen
     observations = prepared.observations
     size = f"{observations.width} x {observations.height}"
-    where = (
-        f"pictures of {size}, taken as they are"
-        if result.framing is None
-        else f"in the {size} crop"
-    )
+    as_they_are = result.framing is None
+    where = f"pictures of {size}, taken as they are" if as_they_are else f"in the {size} crop"
     corners = int(observations.visible.sum())
-    lines = [
+    refused = [f"not used: {_name(r.file)}: {escape(r.reason)}" for r in prepared.refused]
+    outliers = [
+        f"left out: corner {c.corner} of {_name(c.file)}, {c.off_px:.1f} px off"
+        for c in prepared.outliers
+    ]
+    for line in (
         f"{len(observations)} of {prepared.images} boards, {corners} corners, {where}",
         *partial_board_lines(observations),
-        *_first(
-            (f"  not used: {_name(r.file)}: {escape(r.reason)}" for r in prepared.refused),
-            "more (--json, --report)",
-        ),
-        *_first(
-            (
-                f"  left out: corner {c.corner} of {_name(c.file)}, {c.off_px:.1f} px off"
-                for c in prepared.outliers
-            ),
-            "more corners",
-        ),
-    ]
-    for line in lines:
+        *_first(refused, "more (--json, --report)"),
+        *_first(outliers, "more corners"),
+    ):
         screen.print(line)
     screen.print(_table(result))
     if compare:
@@ -262,21 +231,19 @@ def print_result(screen: Console, result: CalibrationResult, compare: bool) -> N
 def partial_board_lines(observations: CornerObservations) -> list[str]:
     """A line for each board of which some corners are not used, the emptiest first."""
     whole, counts = observations.pattern.count, observations.visible.sum(1)
-    rows = [int(row) for row in np.argsort(counts, kind="stable") if counts[row] < whole]
-    return _first(
-        (
-            f"  in part: {_name(observations.names[n])}, {counts[n]} of {whole} corners"
-            for n in rows
-        ),
-        "more boards in part (--json, --report)",
-    )
+    lines = [
+        f"in part: {_name(observations.names[row])}, {counts[row]} of {whole} corners"
+        for row in np.argsort(counts, kind="stable")
+        if counts[row] < whole
+    ]
+    return _first(lines, "more boards in part (--json, --report)")
 
 
-def _first(lines: Iterable[str], what: str) -> list[str]:
-    """The first few lines, and one that counts the others."""
-    every = list(lines)
-    more = len(every) - _MOST_NAMED
-    return every[:_MOST_NAMED] + ([f"  and {more} {what}"] if more > 0 else [])
+def _first(lines: list[str], what: str) -> list[str]:
+    """The first few lines, indented, and one that counts the others."""
+    more = len(lines) - _MOST_NAMED
+    shown = lines[:_MOST_NAMED] + ([f"and {more} {what}"] if more > 0 else [])
+    return [f"  {line}" for line in shown]
 
 
 def _name(file: str) -> str:
@@ -285,10 +252,9 @@ def _name(file: str) -> str:
 
 def _table(result: CalibrationResult) -> Table:
     fits, folds = result.comparison.ranked, result.comparison.folds
-    every_image = folds == len(result.comparison.prepared.observations)
-    how = (
-        "each picture from all others" if every_image else f"each of {folds} folds from the others"
-    )
+    how = f"each of {folds} folds from the others"
+    if folds == len(result.comparison.prepared.observations):
+        how = "each picture from all others"
     rows = [model_row(fit) for fit in fits]
     return text_table(
         MODEL_COLUMNS,

@@ -28,10 +28,10 @@ from bikeped.lab.calibration.capture.coverage import (
 )
 from bikeped.lab.calibration.capture.guide import CaptureGuide, FrameStatus
 from bikeped.lab.calibration.capture.live_session import (
-    LivePage,
     LiveSession,
     add_live_page,
     capture_boards,
+    live_page,
 )
 from bikeped.lab.calibration.corners.candidates import assumed_lens
 from bikeped.types import Frame, ImageArray
@@ -221,9 +221,9 @@ async def test_the_page_tells_and_streams() -> None:
 
 async def test_the_page_of_its_own_serves_this_machine_only() -> None:
     session = LiveSession(guide())
-    with LivePage(session, port=0) as page:
-        assert page.url is not None
-        port = int(page.url.split(":")[2].split("/")[0])
+    with live_page(session, port=0) as (url, _):
+        assert url is not None
+        port = int(url.split(":")[2].split("/")[0])
         for host, expected in (("localhost", b"200"), ("evil.example", b"403")):
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
             head = f"Host: {host}:{port}\r\nConnection: close\r\n\r\n"
@@ -236,7 +236,7 @@ async def test_the_page_of_its_own_serves_this_machine_only() -> None:
                 assert (
                     json.loads(answer.split(b"\r\n\r\n", 1)[1])["says"] == "waiting for the camera"
                 )
-        with LivePage(LiveSession(guide()), port=port) as second:
-            assert second.url is None
-            assert "web.port to a free one" in str(second.error)
+        with live_page(LiveSession(guide()), port=port) as (url, error):
+            assert url is None
+            assert "web.port to a free one" in str(error)
     assert session.stopped

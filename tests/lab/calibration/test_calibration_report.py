@@ -19,13 +19,14 @@ from bikeped.errors import CalibrationError
 from bikeped.geometry import Framing, Lens
 from bikeped.lab.calibration.board_view import RefusedImage
 from bikeped.lab.calibration.capture.coverage import CircleSector, Coverage
+from bikeped.lab.calibration.capture.images import CalibrationImage
 from bikeped.lab.calibration.report.field_of_view import (
     FieldOfView,
     brightest_pixels,
     circle_radius_px,
     field_of_view,
 )
-from bikeped.lab.calibration.report.html_report import Thumbnail, report_page
+from bikeped.lab.calibration.report.html_report import report_page
 from bikeped.lab.calibration.report.results import (
     CalibrationResult,
     calibration_cautions,
@@ -201,8 +202,9 @@ def test_the_page_is_whole_by_itself(done: ModelComparison) -> None:
             the_field(done),
             Coverage([CircleSector(1, 1.5, 0, 1, "upper <left>")]),
             ["mind <this>"],
+            FRAMING,
         ),
-        [Thumbnail(name, gray, FRAMING.offset_px) for name in views],
+        [CalibrationImage(name, 3840, 2160, "", gray) for name in views],
     )
     parser = _Links()
     parser.feed(page)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.lab.calibration.corners.saddle_points import find_saddle_points, link_neighbours
+from bikeped.lab.calibration.corners.grid_growing import find_saddle_points, link_neighbours
 from bikeped.types import FloatArray, ImageArray
 
 

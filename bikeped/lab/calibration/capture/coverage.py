@@ -127,22 +127,16 @@ def circle_sectors(
     half = lens.max_theta_rad
     rings = max(2, round(math.degrees(half) / _RING_DEG))
     edges = [float(edge) for edge in np.linspace(0, half, rings + 1)]
+    depths = ["the middle", "beside the middle", *["half-way out"] * (rings - 4), "near the rim"]
+    depths = [*depths[: rings - 1], "at the rim"]
     step = 2 * math.pi / len(_DIRECTIONS)
-    sectors = [CircleSector(0.0, edges[1], 0.0, 2 * math.pi, "the middle")]
+    sectors = [CircleSector(0.0, edges[1], 0.0, 2 * math.pi, depths[0])]
     for ring in range(1, rings):
         for number, direction in enumerate(_DIRECTIONS):
             start = (number - 0.5) * step
-            where = f"{direction}, {_depth(ring, rings)}"
+            where = f"{direction}, {depths[ring]}"
             sectors.append(CircleSector(edges[ring], edges[ring + 1], start, start + step, where))
     return [s for s in sectors if _share_on_image(s, lens, centre_px, window_px) > _EXISTS]
-
-
-def _depth(ring: int, rings: int) -> str:
-    if ring == rings - 1:
-        return "at the rim"
-    if ring == rings - 2 and rings > 3:
-        return "near the rim"
-    return "beside the middle" if ring == 1 else "half-way out"
 
 
 def _share_on_image(

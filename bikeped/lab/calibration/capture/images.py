@@ -51,9 +51,7 @@ def load_images(paths: Iterable[Path | str]) -> list[CalibrationImage]:
     CalibrationError, naming file and remedy: missing, unreadable, of another size than the first,
     or none at all.
     """
-    images: list[CalibrationImage] = []
-    for entry in paths:
-        images.extend(_load(Path(entry)))
+    images = [image for entry in paths for image in _load(Path(entry))]
     if not images:
         raise CalibrationError(
             "no picture to calibrate from; name files, a folder of pictures or a video"
@@ -130,7 +128,7 @@ def _image(path: Path) -> CalibrationImage:
 
 def _video(path: Path) -> list[CalibrationImage]:
     """The sharpest frame of every piece of a video."""
-    chosen: dict[int, tuple[float, CalibrationImage]] = {}
+    chosen: dict[int, tuple[float, CalibrationImage]] = {}  # by piece: sharpness, image
     length_s = VIDEO_PIECE_S
     try:
         with VideoSource(path) as source:
@@ -140,22 +138,13 @@ def _video(path: Path) -> list[CalibrationImage]:
                 piece = int(frame.captured_s / length_s)
                 if piece not in chosen or score > chosen[piece][0]:
                     chosen[piece] = score, _of_frame(frame, grey, path)
-                if len(chosen) > VIDEO_PIECES:
+                if len(chosen) > VIDEO_PIECES:  # two pieces become one
                     length_s *= 2
-                    chosen = _halved(chosen)
+                    best_last = sorted(chosen.items(), key=lambda item: (item[1][0], -item[0]))
+                    chosen = {number // 2: found for number, found in best_last}
     except CaptureError as error:
         raise CalibrationError(str(error)) from error
     return [image for _, (_, image) in sorted(chosen.items(), key=lambda item: item[0])]
-
-
-def _halved(
-    chosen: dict[int, tuple[float, CalibrationImage]],
-) -> dict[int, tuple[float, CalibrationImage]]:
-    out: dict[int, tuple[float, CalibrationImage]] = {}
-    for piece, (score, image) in chosen.items():
-        if piece // 2 not in out or score > out[piece // 2][0]:
-            out[piece // 2] = score, image
-    return out
 
 
 def _of_frame(frame: Frame, grey: ImageArray, path: Path) -> CalibrationImage:

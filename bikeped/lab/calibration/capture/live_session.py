@@ -1,7 +1,7 @@
 """A live capture: reads a source, guides the person with the board, saves the boards to keep.
 
 The work takes place in the caller's thread; `LiveSession` is what other threads read, and
-`LivePage` shows it in a browser. Not run on a camera at a pole yet: tested with recorded and drawn
+`live_page` shows it in a browser. Not run on a camera at a pole yet: tested with recorded and drawn
 frames.
 """
 
@@ -14,7 +14,6 @@ import queue
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -242,51 +241,31 @@ def add_live_page(app: web.Application, session: LiveSession) -> None:
     app.router.add_get("/calibrate/stream", stream)
 
 
-class LivePage:
-    """Serves the page to this machine from a thread of its own; a context manager.
+@contextlib.contextmanager
+def live_page(session: LiveSession, *, port: int) -> Iterator[tuple[str | None, str | None]]:
+    """Serves the page to this machine from a thread of its own; gives its address and the error.
 
-    `url` is its address, None when the port cannot be bound (`error` says why): the console guides
-    as well.
+    The address is None when the port cannot be bound: the console guides as well.
     """
+    config = WebConfig(host="127.0.0.1", port=port)
+    add = functools.partial(add_live_page, session=session)
+    server = HttpServer(make_application(load_access_policy(config), add), config)
+    ready, ended = threading.Event(), threading.Event()
 
-    def __init__(self, session: LiveSession, *, port: int = 8080) -> None:
-        self._session = session
-        self._config = WebConfig(host="127.0.0.1", port=port)
-        self._loop = asyncio.new_event_loop()
-        self._ready, self._stop = threading.Event(), asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name="calibration-page", daemon=True)
-        self.url: str | None = None
-        self.error: str | None = None
-
-    def __enter__(self) -> LivePage:
-        self._thread.start()
-        self._ready.wait()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._session.stop()
-        self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join()
-
-    def _run(self) -> None:
+    async def serve() -> None:
         try:
-            self._loop.run_until_complete(self._serve())
-            self._loop.run_until_complete(self._loop.shutdown_default_executor())
+            await server.start()
         finally:
-            self._ready.set()
-            self._loop.close()
-
-    async def _serve(self) -> None:
-        add = functools.partial(add_live_page, session=self._session)
-        server = HttpServer(make_application(load_access_policy(self._config), add), self._config)
-        if await server.start():
-            self.url = f"{server.address}calibrate"
-        self.error = server.error
-        self._ready.set()
-        await self._stop.wait()
+            ready.set()
+        await asyncio.to_thread(ended.wait)
         await server.stop()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    thread.start()
+    ready.wait()
+    try:
+        yield f"{server.address}calibrate" if server.address else None, server.error
+    finally:
+        session.stop()
+        ended.set()
+        thread.join()

@@ -104,7 +104,8 @@ def orient_corners(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -
     not turned by more than 90 degrees. A square pattern is treated likewise.
     """
     grid: FloatArray = uv_px.reshape(pattern.rows, pattern.columns, 2)
-    if _handedness(grid) < 0:
+    right, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
+    if np.median(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]) < 0:
         grid = grid[:, ::-1]
     ways = [grid, grid[::-1, ::-1]]
     if pattern.columns == pattern.rows:
@@ -113,11 +114,6 @@ def orient_corners(grey: ImageArray, pattern: BoardPattern, uv_px: FloatArray) -
     allowed = [way for way, first in zip(ways, dark, strict=True) if first] or ways
     best = max(allowed, key=_rightward)
     return np.asarray(best.reshape(-1, 2))
-
-
-def _handedness(grid: FloatArray) -> float:
-    right, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
-    return float(np.median(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]))
 
 
 def _rightward(grid: FloatArray) -> float:
@@ -180,12 +176,9 @@ def _continues_beyond(
 ) -> bool:
     """Whether one of the board's sides is followed by another line of corners."""
     columns, rows = pattern.columns, pattern.rows
-    for side in (
-        [(-1, r) for r in range(rows)],
-        [(columns, r) for r in range(rows)],
-        [(c, -1) for c in range(columns)],
-        [(c, rows) for c in range(columns)],
-    ):
+    sides = [[(c, r) for r in range(rows)] for c in (-1, columns)]
+    sides += [[(c, r) for c in range(columns)] for r in (-1, rows)]
+    for side in sides:
         beyond = np.array(side, np.float64)
         score = crossing_score(grey, local_map(beyond, position, uv)) * _checker_sign(beyond)
         if (score > 0.4).mean() > 0.7 or (score < -0.4).mean() > 0.7:

@@ -34,6 +34,15 @@ from bikeped.lab.calibration.corners.grid_growing import CornerGrid, find_grids
 from bikeped.lab.calibration.corners.local_grid import local_map
 from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
 
+_SCALES = (1.0, 2.0, 0.5)  # relative to the scale at which an image is searched first
+#: Of the board's corners: with fewer, chance could make the outer lines, and little is gained.
+LEAST_SHARE = 0.5
+_BOARD_SHARE = 1 / 3  # of the corners: fewer are no board, and need no reason
+_STRANGE_TIMES, _STRANGE = 3.0, 0.1  # residual of a refined corner: times the usual, at least
+_BESIDE_TIMES, _BESIDE = 1.7, 0.015  # the same beside a hidden one
+_USUAL = 0.25  # quantile: more than half of the corners may be disturbed
+_PASSES = 3
+
 
 def check_pattern(pattern: BoardPattern) -> None:
     """CalibrationError for a pattern that no detector can find."""
@@ -68,16 +77,6 @@ def detect_board(
         except BoardRefusedError as refused:
             reason = str(refused) or reason
     raise BoardRefusedError(f"no whole {pattern} board found" + (f": {reason}" if reason else ""))
-
-
-_SCALES = (1.0, 2.0, 0.5)  # relative to the scale at which an image is searched first
-#: Of the board's corners: with fewer, chance could make the outer lines, and little is gained.
-LEAST_SHARE = 0.5
-_BOARD_SHARE = 1 / 3  # of the corners: fewer are no board, and need no reason
-_STRANGE_TIMES, _STRANGE = 3.0, 0.1  # residual of a refined corner: times the usual, at least
-_BESIDE_TIMES, _BESIDE = 1.7, 0.015  # the same beside a hidden one
-_USUAL = 0.25  # quantile: more than half of the corners may be disturbed
-_PASSES = 3
 
 
 def partial_board(grey: ImageArray, pattern: BoardPattern) -> DetectedBoard:

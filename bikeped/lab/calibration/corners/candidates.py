@@ -10,6 +10,7 @@ is wrong by ten or twenty per cent, which is good enough to find corners.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -32,7 +33,6 @@ _SCALES = (1.0, 0.5, 2.0, 0.35)  # relative to the first scale
 _SECTOR_SCALES = (0.5, 1.0)
 _QUICK_SIDE_PX = 640
 _VIEW_SIDE_PX = 800
-_RING_DEG = 50.0
 _RING = 8
 _NO_MAP: Any = None  # the map holds both coordinates; the type stubs want an array
 
@@ -55,7 +55,7 @@ VIEWS = (
     ViewDirection(0, 0, 110),
     ViewDirection(0, 0, 140),
     ViewDirection(0, 0, 180, stereographic=True),
-    *(ViewDirection(_RING_DEG, 360 / _RING * k, 90) for k in range(_RING)),
+    *(ViewDirection(50, 360 / _RING * k, 90) for k in range(_RING)),
     *(ViewDirection(35, 360 / _RING * (k + 0.5), 125) for k in range(0, _RING, 2)),
     *(ViewDirection(60, 360 / _RING * k, 150, stereographic=True) for k in range(0, _RING, 2)),
 )
@@ -93,9 +93,10 @@ def remapped_candidates(grey: ImageArray, pattern: BoardPattern) -> Iterator[Flo
 
 def quick_candidates(grey: ImageArray, pattern: BoardPattern) -> Iterator[FloatArray]:
     """For live frames, most of which hold no board: the fast check at two scales only."""
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK
     for side in (_QUICK_SIDE_PX, FIRST_SIDE_PX):
         scale = min(1.0, side / max(grey.shape))
-        yield from at_scale(classic_with_fast_check, grey, pattern, scale)
+        yield from at_scale(functools.partial(classic, flags=flags), grey, pattern, scale)
 
 
 def first_scale(grey: ImageArray) -> float:
@@ -134,15 +135,9 @@ def classic(
     return _corners(cv2.findChessboardCorners(grey, size, flags=flags), pattern)
 
 
-def classic_with_fast_check(grey: ImageArray, pattern: BoardPattern) -> FloatArray | None:
-    """As `classic`, but gives up early where the image shows no sign of a board."""
-    return classic(grey, pattern, cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK)
-
-
 def sectors(grey: ImageArray, pattern: BoardPattern) -> FloatArray | None:
     """OpenCV's sector-based search (Duda and Frese, 2018): slower, robust to blur, poor light."""
-    size = (pattern.columns, pattern.rows)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE
+    size, flags = (pattern.columns, pattern.rows), cv2.CALIB_CB_NORMALIZE_IMAGE
     return _corners(cv2.findChessboardCornersSB(grey, size, flags=flags), pattern)
 
 

@@ -40,17 +40,12 @@ _OUTLIER = np.float32(0.3)  # of half the window's contrast: residuals beyond we
 _ROOT = np.sqrt(2.0)
 
 
-def _priors() -> FloatArray:
-    """[12] inverse variances of the edge parameters and the grey terms."""
-    out: FloatArray = np.zeros(12)
-    out[[0, 2]], out[4] = _PRIOR_ANGLE**-2, _PRIOR_BLUR**-2
-    out[[6, 7, 9, 10]], out[11] = _PRIOR_SLOPE**-2, _PRIOR_BLEED**-2
-    out *= _NOISE**2
-    out[[1, 3, 5, 8]] = 1e-6
-    return out
-
-
-_PRIOR = _priors()
+#: [12] inverse variances of the edge parameters and the grey terms.
+_PRIOR: FloatArray = np.zeros(12)
+_PRIOR[[0, 2]], _PRIOR[4] = _PRIOR_ANGLE**-2, _PRIOR_BLUR**-2
+_PRIOR[[6, 7, 9, 10]], _PRIOR[11] = _PRIOR_SLOPE**-2, _PRIOR_BLEED**-2
+_PRIOR *= _NOISE**2
+_PRIOR[[1, 3, 5, 8]] = 1e-6
 
 
 @dataclass(frozen=True)
@@ -174,15 +169,8 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 def _quadratic_of(bend: FloatArray, linear: FloatArray) -> FloatArray:
     """B(L d) as factors [n, 2, 3] of du^2, du dv, dv^2; L: matrices [n, 2, 2]."""
     a, b, c, d = linear[:, 0, 0], linear[:, 0, 1], linear[:, 1, 0], linear[:, 1, 1]
-    mix = np.stack(
-        [
-            np.stack([a * a, 2 * a * b, b * b], -1),
-            np.stack([a * c, a * d + b * c, b * d], -1),
-            np.stack([c * c, 2 * c * d, d * d], -1),
-        ],
-        axis=1,
-    )
-    return np.asarray(bend @ mix)
+    rows = [(a * a, 2 * a * b, b * b), (a * c, a * d + b * c, b * d), (c * c, 2 * c * d, d * d)]
+    return np.asarray(bend @ np.stack([np.stack(row, -1) for row in rows], axis=1))
 
 
 def _fit(window: _Window, blur_px: float, steps: int) -> RefinedCorners:
@@ -275,14 +263,8 @@ def _edges(window: _Window, edge: FloatArray, out: Float32Array) -> None:
 
 def _intersection(window: _Window, edge: FloatArray) -> FloatArray:
     """[n, 2] where the two bent edges cross, pixels from the window's corner."""
-    across = np.stack(
-        [
-            np.stack([np.cos(edge[:, 0]), np.sin(edge[:, 0])], -1),
-            np.stack([np.cos(edge[:, 2]), np.sin(edge[:, 2])], -1),
-        ],
-        axis=1,
-    )
-    inverse = _inverse(across)
+    angle = edge[:, [0, 2]]
+    inverse = _inverse(np.stack([np.cos(angle), np.sin(angle)], axis=-1))
     at: FloatArray = np.zeros((len(edge), 2))
     for _ in range(4):
         square = np.stack([at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=-1)

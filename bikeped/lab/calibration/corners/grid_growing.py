@@ -1,6 +1,9 @@
 """Grids of corners grown from saddle points, neighbour by neighbour, around what hides the rest.
 
-A grid counts its own columns and rows; `corner_ids` finds out which ones of the board they are.
+Where four squares meet, the smoothed brightness has a saddle point. Its curvature gives the
+directions of the two edges, through any lens, and which squares are light. Neighbours on a board
+share an edge: light lies on the same side of it all the way from one to the other. A grid counts
+its own columns and rows; `corner_ids` finds out which ones of the board they are.
 """
 
 from __future__ import annotations
@@ -11,20 +14,30 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from bikeped.lab.calibration.corners.local_grid import (
     LocalMap,
     crossing_score,
     local_map,
+    nearest_level,
     neighbour_residual,
 )
-from bikeped.lab.calibration.corners.saddle_points import (
-    SaddlePoints,
-    find_saddle_points,
-    link_neighbours,
-)
-from bikeped.types import BoolArray, FloatArray, ImageArray, IntArray
+from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
+_SMOOTH_PX = 1.5
+_IMAGE_BLUR_PX = 0.7  # of a sharp image; for the contrast only
+_LEAST_CONTRAST = 12.0  # grey levels
+_MOST = 2500  # of the strongest: a cluttered image has thousands
+_PEAK_PX = 5  # side of the window in which a saddle is the strongest
+_OFF_PX = 1.5  # from the strongest pixel to the saddle itself
+_ROUND_PX = 3.0  # where the four squares about a saddle point are sampled, ...
+_ROUND_SHARE = 0.3  # ... and of the contrast, what light and dark ones must differ by
+_NEIGHBOURS = 32  # examined around each
+_ALIGNED = np.cos(np.radians(22.0))  # a link and the edges at both ends
+_ALONG = np.array([0.25, 0.4, 0.6, 0.75])  # where an edge is sampled
+_ACROSS = 0.15  # to either side of it, as a share of its length
+_EDGE_SHARE = 0.25  # of the contrast that an edge must keep everywhere
 _FEWEST = 6  # corners that a grid begins with
 _GRIDS = 3  # of a picture, the largest
 _CLEAR = 0.3  # `crossing_score` of a corner
@@ -35,6 +48,127 @@ _NEAR = 3  # columns and rows to either side that predict where a new corner lie
 _KNOWN_BY = 5  # ... by at least so many corners
 _ROUNDS = 40
 _STEPS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+
+
+@dataclass(frozen=True)
+class SaddlePoints:
+    """Crossings `uv_px` [n, 2], `contrast` [n] grey levels, `edge` [n, 2 (type), 2] unit vectors.
+
+    Smoothing makes right angles of slanting crossings, so edges are off by half of the difference.
+    Looking along an edge of type 0, to either end, light lies to the left in the image
+    (u right, v down); of type 1, to the right.
+    """
+
+    uv_px: FloatArray
+    contrast: FloatArray
+    edge: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+
+def find_saddle_points(grey: ImageArray) -> SaddlePoints:
+    """The strongest saddle points of an image [height, width]: corners, and similar structures."""
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SMOOTH_PX)
+    one, slope, bend = (np.array(k, np.float32) for k in ([1], [-0.5, 0, 0.5], [1, -2, 1]))
+    part = [
+        cv2.sepFilter2D(smooth, cv2.CV_32F, x, y)
+        for x, y in ((slope, one), (one, slope), (bend, one), (slope, slope), (one, bend))
+    ]
+    depth = np.asarray(part[3] * part[3] - part[2] * part[4])
+    peak = depth >= cv2.dilate(depth, np.ones((_PEAK_PX, _PEAK_PX), np.uint8))
+    # A crossing of contrast C, smoothed by s, has the mixed derivative C / (pi s^2).
+    unit = np.pi * (_SMOOTH_PX**2 + _IMAGE_BLUR_PX**2)
+    peak &= depth > (_LEAST_CONTRAST / unit) ** 2
+    row, column = np.nonzero(peak)
+    gu, gv, uu, uv, vv = (np.asarray(p[row, column], np.float64) for p in part)
+    deep = depth[row, column].astype(np.float64)
+    # The saddle itself, by one step of Newton: on a mere edge that lies far off.
+    off = np.stack([vv * gu - uv * gv, uu * gv - uv * gu], axis=-1) / deep[:, None]
+    at = np.stack([column, row], axis=-1) + off
+    size = np.array([grey.shape[1] - 1, grey.shape[0] - 1])
+    near = (np.abs(off) < _OFF_PX).all(1) & (at >= 0).all(1) & (at <= size).all(1)
+    which = np.flatnonzero(near)
+    light = np.arctan2(2 * uv, uu - vv) / 2  # the way to where it rises fastest
+    contrast = np.sqrt(deep) * unit
+    which = which[
+        _four_squares(np.asarray(smooth, np.float32), at[which], light[which], contrast[which])
+    ]
+    which = which[np.argsort(-deep[which], kind="stable")[:_MOST]]
+    edge = _edges(uu[which], uv[which], vv[which])
+    return SaddlePoints(at[which], contrast[which], edge)
+
+
+def _four_squares(
+    smooth: Float32Array, at: FloatArray, light: FloatArray, contrast: FloatArray
+) -> BoolArray:
+    """[n] where both light squares are lighter than both dark ones: no mere corner of a square."""
+    angle = light[:, None] + np.arange(4) * np.pi / 2
+    around = at[:, None] + _ROUND_PX * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    level = nearest_level(smooth, around)
+    least = level[:, [0, 2]].min(1) - level[:, [1, 3]].max(1)
+    return np.asarray(least > _ROUND_SHARE * contrast)
+
+
+def _edges(uu: FloatArray, uv: FloatArray, vv: FloatArray) -> FloatArray:
+    """[n, 2, 2] the two ways along which a saddle is flat."""
+    middle = (uu + vv) / 2
+    spread = np.hypot((uu - vv) / 2, uv)
+    light = np.arctan2(2 * uv, uu - vv) / 2  # where it rises fastest, to both sides
+    open_by = np.arctan2(np.sqrt(spread + middle), np.sqrt(np.maximum(spread - middle, 0)))
+    angle = np.stack([light + open_by, light - open_by], axis=-1)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def link_neighbours(grey: ImageArray, points: SaddlePoints) -> IntArray:
+    """[n, 2 (type), 2 (along the edge, against it)] each saddle's neighbour; -1 where none.
+
+    The nearest along the edge whose own edge runs on and turns its colours, with the edge visible
+    all the way; only where both find each other.
+    """
+    out: IntArray = np.full((len(points), 2, 2), -1, np.int64)
+    if len(points) < 2:
+        return out
+    count = min(_NEIGHBOURS + 1, len(points))
+    far, other = KDTree(points.uv_px).query(points.uv_px, count)
+    source = np.repeat(np.arange(len(points)), count)
+    target, length = np.asarray(other).ravel(), np.asarray(far).ravel()
+    apart = (target != source) & (length > 2.0)
+    source, target, length = source[apart], target[apart], length[apart]
+    way = (points.uv_px[target] - points.uv_px[source]) / length[:, None]
+    for kind in (0, 1):
+        start = (points.edge[source, kind] * way).sum(1)
+        end = (points.edge[target, 1 - kind] * way).sum(1)
+        fits = np.flatnonzero((np.abs(start) > _ALIGNED) & (np.abs(end) > _ALIGNED))
+        a, b = source[fits], target[fits]
+        fits = fits[_visible(grey, points, a, b, light_left=kind == 0)]
+        # The nearest last, so that it is the one that stays.
+        fits = fits[np.argsort(-length[fits], kind="stable")]
+        out[source[fits], kind, (start[fits] < 0).astype(np.intp)] = target[fits]
+    return _mutual(out)
+
+
+def _visible(
+    grey: ImageArray, points: SaddlePoints, a: IntArray, b: IntArray, *, light_left: bool
+) -> IntArray:
+    """Which of the links from `a` to `b` follow an edge that is light on one side throughout."""
+    step = points.uv_px[b] - points.uv_px[a]
+    left = np.stack([step[:, 1], -step[:, 0]], axis=-1) * (_ACROSS if light_left else -_ACROSS)
+    on = points.uv_px[a][:, None] + _ALONG[:, None] * step[:, None]
+    level = [nearest_level(grey, on + side * left[:, None]) for side in (1, -1)]
+    contrast = np.minimum(points.contrast[a], points.contrast[b])
+    return np.flatnonzero((level[0] - level[1] > _EDGE_SHARE * contrast[:, None]).all(1))
+
+
+def _mutual(found: IntArray) -> IntArray:
+    """Only links that are found from both ends, along edges of opposite types."""
+    out = found.copy()
+    for kind in (0, 1):
+        other = found[:, kind]
+        back = found[other, 1 - kind]  # [n, 2, 2]; nonsense where other is -1
+        known = (back == np.arange(len(found))[:, None, None]).any(2)
+        out[:, kind][~known | (other < 0)] = -1
+    return out
 
 
 @dataclass(frozen=True)
@@ -126,10 +260,8 @@ def _component(points: SaddlePoints, link: IntArray, seed: int, free: set[int]) 
         kind, against = right_of[one]
         right = points.edge[one, kind] * (1 - 2 * against)
         down_kind = 1 - kind
-        turned = (
-            right[0] * points.edge[one, down_kind, 1] - right[1] * points.edge[one, down_kind, 0]
-        )
-        down_against = int(turned < 0)
+        down = points.edge[one, down_kind]
+        down_against = int(right[0] * down[1] - right[1] * down[0] < 0)
         for step in _STEPS:
             along_row = step[0] != 0
             way_kind = kind if along_row else down_kind
@@ -141,15 +273,14 @@ def _component(points: SaddlePoints, link: IntArray, seed: int, free: set[int]) 
             cells[place], at[other] = other, place
             # Types alternate; its right points as this one's does.
             way_right = points.edge[other, 1 - kind]
+            travel = (points.uv_px[other] - points.uv_px[one]) * step.sum()
             if along_row:
-                travel = (points.uv_px[other] - points.uv_px[one]) * step[0]
-                right_of[other] = 1 - kind, int(travel @ way_right < 0)
+                opposite = travel @ way_right < 0
             else:
-                travel = (points.uv_px[other] - points.uv_px[one]) * step[1]
                 down = points.edge[other, kind]
                 down = down if travel @ down > 0 else -down
-                cross = way_right[0] * down[1] - way_right[1] * down[0]
-                right_of[other] = 1 - kind, int(cross < 0)
+                opposite = way_right[0] * down[1] - way_right[1] * down[0] < 0
+            right_of[other] = 1 - kind, int(opposite)
             waiting.append(other)
     cell = np.array(list(cells), np.int64).reshape(-1, 2)
     return _SaddleGrid(cell, np.array(list(cells.values()), np.int64))
@@ -162,9 +293,7 @@ def _grow(grey: ImageArray, points: SaddlePoints, start: _SaddleGrid) -> _Saddle
         if now is None:
             return None
         # Two steps only where one leads nowhere: over a finger, to the other side.
-        more = _next(grey, points, now, 1)
-        if more is None:
-            more = _next(grey, points, now, 2)
+        more = _next(grey, points, now, 1) or _next(grey, points, now, 2)
         if more is None:
             break
         before = len(now.cell)
@@ -212,9 +341,8 @@ def _next(grey: ImageArray, points: SaddlePoints, now: _SaddleGrid, far: int) ->
     order = order[np.unique(point[order], return_index=True)[1]]
     if not len(order):
         return None
-    return _SaddleGrid(
-        np.concatenate([now.cell, cell[order]]), np.concatenate([now.point, point[order]])
-    )
+    cell = np.concatenate([now.cell, cell[order]])
+    return _SaddleGrid(cell, np.concatenate([now.point, point[order]]))
 
 
 def _clean(grey: ImageArray, points: SaddlePoints, now: _SaddleGrid) -> _SaddleGrid | None:
@@ -244,12 +372,8 @@ def _largest_part(now: _SaddleGrid) -> _SaddleGrid | None:
     there = np.zeros(at.max(0) + 1, np.bool_)
     there[at[:, 0], at[:, 1]] = True
     wide = there.copy()
-    for axis in (0, 1):
-        both = np.zeros_like(there)
-        middle = np.moveaxis(both, axis, 0)
-        rows = np.moveaxis(there, axis, 0)
-        middle[1:-1] = rows[:-2] & rows[2:]
-        wide |= both
+    wide[1:-1] |= there[:-2] & there[2:]
+    wide[:, 1:-1] |= there[:, :-2] & there[:, 2:]
     part = cv2.connectedComponents(wide.astype(np.uint8), connectivity=4)[1]
     mine = part[at[:, 0], at[:, 1]]
     keep = mine == int(np.bincount(mine).argmax())

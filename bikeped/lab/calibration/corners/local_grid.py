@@ -105,10 +105,10 @@ def repair_corners(
     return None
 
 
-def quadrants(grey: ImageArray, near: LocalMap, share: float = 0.3) -> FloatArray:
+def quadrants(grey: ImageArray, near: LocalMap) -> FloatArray:
     """[n, 4] grey levels diagonally off each corner, in the squares up-left, up-right, down-left,
     down-right of it; NaN outside the picture."""
-    step = share * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+    step = 0.3 * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
     return sample(grey, near.at_steps(step))
 
 

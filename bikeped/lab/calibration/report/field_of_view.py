@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -73,12 +74,7 @@ def field_of_view(
 
 def brightest_pixels(greys: Iterable[ImageArray]) -> ImageArray:
     """[h, w] each pixel's brightest value over the images: dark only outside the image circle."""
-    out: ImageArray | None = None
-    for grey in greys:
-        out = grey.copy() if out is None else np.maximum(out, grey, out=out)
-    if out is None:
-        raise ValueError("brightest_pixels: no images")
-    return out
+    return functools.reduce(np.maximum, greys)
 
 
 def circle_radius_px(bright: ImageArray, centre_px: FloatArray) -> float | None:

@@ -1,7 +1,8 @@
-"""The figures of the calibration report, each a PNG."""
+"""The figures of the calibration report, each a PNG in base64."""
 
 from __future__ import annotations
 
+import base64
 import io
 import itertools
 from collections.abc import Sequence
@@ -25,14 +26,14 @@ if TYPE_CHECKING:
 _BIN_DEG = 10.0
 
 
-def png(sheet: FigureSheet) -> bytes:
-    """The sheet's picture; the same drawing gives the same bytes."""
+def _png(sheet: FigureSheet) -> str:
+    """The sheet's picture in base64; the same drawing gives the same bytes."""
     data = io.BytesIO()
     sheet.figure.savefig(data, format="png", metadata={"Software": None})
-    return data.getvalue()
+    return base64.b64encode(data.getvalue()).decode("ascii")
 
 
-def comparison_figure(comparison: ModelComparison, chosen: str) -> bytes:
+def comparison_figure(comparison: ModelComparison, chosen: str) -> str:
     """RMS and cross-validated error of every model, least last."""
     fits = comparison.ranked[::-1]
     rows = np.arange(len(fits))
@@ -72,7 +73,7 @@ def comparison_figure(comparison: ModelComparison, chosen: str) -> bytes:
         axes.set_xlim(low, high * 1.25)
         axes.grid(axis="y", visible=False)
         axes.legend(loc="upper right")
-        return png(sheet)
+        return _png(sheet)
 
 
 def _plain_log(axes: Axes) -> None:
@@ -97,7 +98,7 @@ def radial_residuals(fit: LensFit) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.degrees(fit.angles_rad[seen]), along, across
 
 
-def angle_figure(fit: LensFit, field: FieldOfView) -> bytes:
+def angle_figure(fit: LensFit, field: FieldOfView) -> str:
     """Residuals against the angle from the axis."""
     theta, along, across = radial_residuals(fit)
     edges = np.arange(0, np.degrees(field.half_rad) + _BIN_DEG, _BIN_DEG)
@@ -133,10 +134,10 @@ def angle_figure(fit: LensFit, field: FieldOfView) -> bytes:
             axes.set_ylabel(f"{what}, px")
         sheet.axes[-1].set_xlabel("angle from the axis, degrees")
         sheet.axes[-1].set_xlim(0, np.degrees(field.half_rad) * 1.04)
-        return png(sheet)
+        return _png(sheet)
 
 
-def profile_figure(fit: LensFit, field: FieldOfView) -> bytes:
+def profile_figure(fit: LensFit, field: FieldOfView) -> str:
     """r(theta), and its difference from the four ideal lenses of the same slope on the axis."""
     theta: FloatArray = np.linspace(0.0, field.half_rad, 400, dtype=np.float64)
     degrees = np.degrees(theta)
@@ -179,10 +180,10 @@ def profile_figure(fit: LensFit, field: FieldOfView) -> bytes:
         right.set_ylabel("ideal minus fitted radius, px")
         handles = [*left.get_lines()[:1], *right.get_lines()[: len(FISHEYE)]]
         sheet.legend(handles, columns=3)
-        return png(sheet)
+        return _png(sheet)
 
 
-def board_figure(fit: LensFit) -> bytes:
+def board_figure(fit: LensFit) -> str:
     """The board's fitted shape: out of the plane as colours, in the plane as arrows."""
     pattern = fit.observations.pattern
     flat, shape = fit.observations.flat, fit.state.shape * 100
@@ -222,10 +223,10 @@ def board_figure(fit: LensFit) -> bytes:
         axes.set_xticks([])
         axes.set_yticks([])
         sheet.figure.colorbar(shown, ax=axes, label="out of the plane, % of a square", shrink=0.85)
-        return png(sheet)
+        return _png(sheet)
 
 
-def coverage_figure(fit: LensFit, field: FieldOfView, gaps: Sequence[CircleSector] = ()) -> bytes:
+def coverage_figure(fit: LensFit, field: FieldOfView, gaps: Sequence[CircleSector] = ()) -> str:
     """All corners by their direction in the lens: the angle from the axis as radius."""
     points = camera_points(fit.state, fit.observations.flat)[fit.observations.visible]
     theta, phi = np.degrees(angles(points)), np.arctan2(points[:, 1], points[:, 0])
@@ -257,4 +258,4 @@ def coverage_figure(fit: LensFit, field: FieldOfView, gaps: Sequence[CircleSecto
         axes.set_rlabel_position(45)  # type: ignore[attr-defined]
         axes.set_yticks(np.arange(30, half, 30), [f"{d:.0f}°" for d in np.arange(30, half, 30)])
         axes.set_xticks(np.radians([0, 90, 180, 270]), ["right", "down", "left", "up"])
-        return png(sheet)
+        return _png(sheet)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from bikeped import __version__
+from bikeped.lab.calibration.capture.images import CalibrationImage
 from bikeped.lab.calibration.report.figures import (
     angle_figure,
     board_figure,
@@ -29,8 +30,8 @@ from bikeped.types import FloatArray, ImageArray
 _TEMPLATES = Path(__file__).with_name("templates")
 
 
-def report_page(result: CalibrationResult, thumbnails: Sequence[Thumbnail]) -> str:
-    """The page; `thumbnails`: the images that were used, in any order."""
+def report_page(result: CalibrationResult, images: Sequence[CalibrationImage]) -> str:
+    """The page; `images`: at least those that were used, in any order."""
     comparison, fit, field = result.comparison, result.chosen, result.field
     prepared = comparison.prepared
     several = len(comparison.fits) > 1
@@ -45,15 +46,15 @@ def report_page(result: CalibrationResult, thumbnails: Sequence[Thumbnail]) -> s
         models=[model_row(f) for f in comparison.ranked],
         recommendation=result.recommendation.reason,
         criterion=paper_criterion(comparison),
-        comparison_png=_base64(comparison_figure(comparison, fit.name)) if several else "",
-        coverage_png=_base64(coverage_figure(fit, field, result.coverage.gaps)),
+        comparison_png=comparison_figure(comparison, fit.name) if several else "",
+        coverage_png=coverage_figure(fit, field, result.coverage.gaps),
         advice=result.coverage.advice(),
-        profile_png=_base64(profile_figure(fit, field)),
-        angle_png=_base64(angle_figure(fit, field)),
+        profile_png=profile_figure(fit, field),
+        angle_png=angle_figure(fit, field),
         parameters=_parameter_rows(fit),
-        board_png=_base64(board_figure(fit)) if fit.model.board else "",
+        board_png=board_figure(fit) if fit.model.board else "",
         arrow_scale=arrow_scale,
-        cards=image_cards(fit, thumbnails, arrow_scale),
+        cards=image_cards(result, images, arrow_scale),
         unused=[
             *((Path(r.file).name, r.reason) for r in prepared.refused),
             *(
@@ -67,7 +68,7 @@ def report_page(result: CalibrationResult, thumbnails: Sequence[Thumbnail]) -> s
                 s.steps,
                 f"{s.cost_before:.4g}",
                 f"{s.cost_after:.4g}",
-                f"{s.slope:.1e}",
+                f"{s.gradient:.1e}",
                 s.stopped,
                 "yes" if s.kept else "no",
             )
@@ -77,10 +78,6 @@ def report_page(result: CalibrationResult, thumbnails: Sequence[Thumbnail]) -> s
         now=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         images_hash=prepared.images_hash,
     )
-
-
-def _base64(png: bytes) -> str:
-    return base64.b64encode(png).decode("ascii")
 
 
 def _tiles(result: CalibrationResult) -> list[tuple[str, str]]:
@@ -124,15 +121,6 @@ _QUALITY = 72
 
 
 @dataclass(frozen=True)
-class Thumbnail:
-    """One image, and where its pixel (0, 0) lies in the crop in which the fit's pixels count."""
-
-    name: str
-    grey: ImageArray
-    offset_px: tuple[int, int] = (0, 0)
-
-
-@dataclass(frozen=True)
 class Card:
     """One image's figure: SVG attributes in pixels of the crop, and the caption."""
 
@@ -147,13 +135,15 @@ class Card:
 
 
 def image_cards(
-    fit: LensFit, thumbnails: Sequence[Thumbnail], arrow_scale: float
+    result: CalibrationResult, images: Sequence[CalibrationImage], arrow_scale: float
 ) -> Iterator[Card]:
     """One card an image, the worst first; residuals are drawn `arrow_scale` times as long."""
-    observations = fit.observations
+    fit, observations = result.chosen, result.chosen.observations
+    # Where an image's pixel (0, 0) lies in the crop in which the fit's pixels count.
+    offset_px = (0, 0) if result.framing is None else result.framing.offset_px
     errors = rms_by_image(fit.residuals_px, observations)
     held = None if fit.held_out_px is None else rms_by_image(fit.held_out_px, observations)
-    by_name = {thumbnail.name: thumbnail for thumbnail in thumbnails}
+    by_name = {image.name: image for image in images}
     for row in np.argsort(errors)[::-1]:
         visible = observations.visible[row]
         uv = observations.uv_px[row][visible]
@@ -171,7 +161,7 @@ def image_cards(
             f"{observations.pattern.count} corners",
             " ".join(f"{value:.1f}" for value in (*low, *(high - low))),
             zoom,
-            *_image(by_name.get(observations.names[row]), low, high, zoom),
+            *_image(by_name[observations.names[row]].grey(), offset_px, low, high, zoom),
             "".join(f"M{a:.2f} {b:.2f}L{c:.2f} {d:.2f}" for (a, b), (c, d) in ends),
             "".join(f"M{u:.2f} {v:.2f}h0" for u, v in start),
         )
@@ -194,22 +184,19 @@ def _frame(uv: FloatArray, arrows: FloatArray, fit: LensFit) -> tuple[FloatArray
 
 
 def _image(
-    thumbnail: Thumbnail | None, low: FloatArray, high: FloatArray, zoom: float
+    grey: ImageArray, offset_px: tuple[int, int], low: FloatArray, high: FloatArray, zoom: float
 ) -> tuple[str, tuple[float, float, int, int]]:
     """JPEG (base64) and place of the image's part between two positions [2] in the crop."""
-    if thumbnail is None:
-        return "", (0, 0, 0, 0)
-    offset = np.asarray(thumbnail.offset_px, dtype=np.float64)
-    height, width = thumbnail.grey.shape[:2]
+    offset = np.asarray(offset_px, dtype=np.float64)
+    height, width = grey.shape[:2]
     u0, v0 = (int(x) for x in np.clip(np.floor(low - offset), 0, [width, height]))
     u1, v1 = (int(x) for x in np.clip(np.ceil(high - offset), 0, [width, height]))
     if u1 <= u0 or v1 <= v0:
         return "", (0, 0, 0, 0)
     shrink = min(1.0, zoom * 1.5)
-    part = thumbnail.grey[v0:v1, u0:u1]
+    part = grey[v0:v1, u0:u1]
     shown = cv2.resize(part, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     _, jpeg = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    first_u, first_v = thumbnail.offset_px
     # A pixel's middle is its position.
-    place = (first_u + u0 - 0.5, first_v + v0 - 0.5, u1 - u0, v1 - v0)
+    place = (offset_px[0] + u0 - 0.5, offset_px[1] + v0 - 0.5, u1 - u0, v1 - v0)
     return base64.b64encode(jpeg.tobytes()).decode("ascii"), place

@@ -6,7 +6,7 @@ import datetime
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,6 @@ def calibration_data(
         ) from error
     observations = fit.observations
     unit = float(unit_radius(fit.model.projection, np.asarray(half)))
-    k1, k2, k3, k4 = fit.state.terms
     return {
         "model": fit.model.projection,
         "cx": fit.cx,
@@ -62,10 +61,7 @@ def calibration_data(
         "focal_length": fit.focal_px,
         "fov_deg": fov_deg,
         "radius_px": fit.focal_px * unit,
-        "k1": k1,
-        "k2": k2,
-        "k3": k3,
-        "k4": k4,
+        **dict(zip(("k1", "k2", "k3", "k4"), fit.state.terms, strict=True)),
         "rms_error_px": fit.rms_px,
         "rms_per_coordinate_px": fit.rms_per_coordinate_px,
         "cross_validated_px": fit.cross_validated_px,
@@ -175,18 +171,7 @@ def _fit_data(fit: LensFit) -> dict[str, Any]:
             Path(name).name: float(error)
             for name, error in zip(fit.observations.names, by_image, strict=True)
         },
-        "stages": [
-            {
-                "name": s.name,
-                "steps": s.steps,
-                "cost_before": s.cost_before,
-                "cost_after": s.cost_after,
-                "gradient": s.slope,
-                "stopped": s.stopped,
-                "kept": s.kept,
-            }
-            for s in fit.stages
-        ],
+        "stages": [asdict(stage) for stage in fit.stages],
     }
 
 

@@ -38,20 +38,14 @@ def gauge_basis(flat: FloatArray) -> FloatArray:
 @functools.lru_cache(maxsize=8)  # every fit of a set uses the same one
 def _basis(flat_bytes: bytes) -> FloatArray:
     flat = np.frombuffer(flat_bytes).reshape(-1, 3)
-    count = len(flat)
-    x, y = flat[:, 0], flat[:, 1]
-    free = np.zeros((7, count, 3))
-    free[0, :, 0] = 1
-    free[1, :, 1] = 1
-    free[2, :, 0], free[2, :, 1] = -y, x
-    free[3, :, 0], free[3, :, 1] = x, y
-    free[4, :, 2] = 1
-    free[5, :, 2] = x
-    free[6, :, 2] = y
-    taken, _ = np.linalg.qr(free.reshape(7, -1).T)
+    x, y, none = flat.T[0], flat.T[1], np.zeros(len(flat))
+    one = none + 1
+    in_plane = [(one, none, none), (none, one, none), (-y, x, none), (x, y, none)]
+    free = np.array([*in_plane, *((none, none, height) for height in (one, x, y))])
+    taken, _ = np.linalg.qr(free.transpose(0, 2, 1).reshape(7, -1).T)
     # The other columns of a complete orthonormal basis.
-    full, _ = np.linalg.qr(np.concatenate([taken, np.eye(3 * count)], axis=1))
-    basis = np.ascontiguousarray(full[:, 7 : 3 * count])
+    full, _ = np.linalg.qr(np.concatenate([taken, np.eye(flat.size)], axis=1))
+    basis = np.ascontiguousarray(full[:, 7 : flat.size])
     basis.flags.writeable = False
     return basis
 
@@ -70,12 +64,6 @@ def board_symmetries(pattern: BoardPattern) -> IntArray:
     ids = np.arange(pattern.count).reshape(pattern.rows, pattern.columns)
     steps = range(4) if pattern.rows == pattern.columns else (0, 2)
     return np.stack([np.rot90(ids, step).ravel() for step in steps])
-
-
-def mirrored_numbering(pattern: BoardPattern) -> IntArray:
-    """[C] the mirrored numbering: columns counted backwards."""
-    ids = np.arange(pattern.count).reshape(pattern.rows, pattern.columns)
-    return ids[:, ::-1].ravel()
 
 
 def symmetry_rotations(flat: FloatArray, numberings: IntArray) -> FloatArray:
@@ -101,7 +89,8 @@ def align_numbering(
     numberings = board_symmetries(pattern)
     away = (state.rotation[:, :, 2] * state.translation).sum(-1) < 0
     odd = away if away.mean() <= 0.5 else ~away
-    handed = np.where(odd[:, None], mirrored_numbering(pattern), numberings[0])
+    backwards = numberings[0].reshape(pattern.rows, pattern.columns)[:, ::-1].ravel()
+    handed = np.where(odd[:, None], backwards, numberings[0])
     mirrored = state.rotation * np.array([-1.0, 1.0, -1.0])
     state = replace(state, rotation=np.where(odd[:, None, None], mirrored, state.rotation))
     rotations = symmetry_rotations(observations.flat, numberings)

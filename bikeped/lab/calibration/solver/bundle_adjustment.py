@@ -8,6 +8,7 @@ criterion, and a stage whose result is worse by it than its start is not kept.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,7 +50,7 @@ class AdjustmentStage:
     steps: int
     cost_before: float  #: by the stage's own criterion, pixels squared
     cost_after: float
-    slope: float  #: largest gradient, in pixels (units of one standard deviation at noise of 1 px)
+    gradient: float  #: the largest, in pixels (units of one standard deviation at noise of 1 px)
     stopped: str  #: why
     kept: bool
 
@@ -122,18 +123,17 @@ def _run_stage(
 ) -> tuple[CalibrationState, AdjustmentStage]:
     """One stage, and its result only if that is better and its radius grows with the angle."""
     found, stage = minimise(observations, model, start, turn_px, name)
-    monotonic = radius_is_monotonic(found, observations)
+    monotonic = _radius_is_monotonic(found, observations)
     if monotonic and np.isfinite(stage.cost_after) and stage.cost_after <= stage.cost_before:
         return found, stage
     why = stage.stopped if monotonic else "the radius would shrink with the angle"
     return start, replace(stage, kept=False, stopped=why)
 
 
-def radius_is_monotonic(state: CalibrationState, observations: CornerObservations) -> bool:
-    """Whether the lens's radius grows with the angle wherever corners were observed."""
+def _radius_is_monotonic(state: CalibrationState, observations: CornerObservations) -> bool:
     if not (np.isfinite(state.lens).all() and state.lens[2] > 0):
         return False
-    if not len(state.lens) > PLAIN:
+    if len(state.lens) <= PLAIN:
         return True
     observed = corner_angles(state, observations)[observations.visible]
     theta: FloatArray = np.linspace(0.0, float(np.quantile(observed, 0.98)), 200, dtype=np.float64)
@@ -173,8 +173,10 @@ def minimise(
         steps += 1
         gained = -1.0
         for _ in range(_MOST_DAMPINGS):
-            trial = _trial(state, normal, damping, basis)
-            if trial is not None:
+            trial = None
+            with contextlib.suppress(np.linalg.LinAlgError):
+                trial = apply_step(state, normal.step(damping), basis)
+            if trial is not None and np.isfinite(trial.lens).all() and trial.lens[2] > 0:
                 trial_error = residuals(trial, observations)
                 trial_cost = cost_of(trial_error, trial)
                 gained = cost - trial_cost
@@ -219,18 +221,6 @@ class ShapePrior:
         return replace(normal, shared=shared, shared_slope=slope)
 
 
-def _trial(
-    state: CalibrationState, normal: NormalEquations, damping: float, basis: FloatArray | None
-) -> CalibrationState | None:
-    """The state after one damped step; None where that gives no lens."""
-    try:
-        step = normal.step(damping)
-    except np.linalg.LinAlgError:
-        return None
-    trial = apply_step(state, step, basis)
-    return trial if np.isfinite(trial.lens).all() and trial.lens[2] > 0 else None
-
-
 def whitened(
     jac: Jacobian, error: FloatArray, turn_px: float | None
 ) -> tuple[Jacobian, FloatArray]:
@@ -246,13 +236,10 @@ def whitened(
     weight = 1 / np.sqrt(1 + square / turn_px**2)
     root = np.sqrt(weight)
     away = error / np.sqrt(np.maximum(square, 1e-300))[..., None]
-    turn = (
-        np.eye(2) - (1 - weight)[..., None, None] * away[..., :, None] * away[..., None, :]
-    ) * root[..., None, None]
-    return (
-        Jacobian(jac.uv_px, turn @ jac.lens, turn @ jac.pose, turn @ jac.shape),
-        error / root[..., None],
-    )
+    along = (1 - weight)[..., None, None] * away[..., :, None] * away[..., None, :]
+    turn = (np.eye(2) - along) * root[..., None, None]
+    turned = Jacobian(jac.uv_px, turn @ jac.lens, turn @ jac.pose, turn @ jac.shape)
+    return turned, error / root[..., None]
 
 
 def loss(error: FloatArray, turn_px: float | None) -> float:

@@ -24,7 +24,7 @@ from bikeped.types import FloatArray
 
 FISHEYE: tuple[Projection, ...] = ("equidistant", "equisolid", "stereographic", "orthographic")
 #: Angles that the farthest corner may lie at, degrees from the axis.
-_FARTHEST_DEG = (20.0, 30.0, 42.0, 55.0, 68.0, 80.0, 90.0, 100.0, 112.0, 125.0)
+_FARTHEST_DEG: tuple[float, ...] = (20.0, 30.0, 42.0, 55.0, 68.0, 80.0, 90.0, 100.0, 112.0, 125.0)
 _SCANNED = 10  # images that the scan uses: the choice needs no more
 _REWEIGHTED = 4
 
@@ -45,14 +45,17 @@ def first_guess(
     # The farthest boards tell projections apart; some near ones stabilise the choice.
     order = np.argsort(offset.max(axis=1))[::-1]
     some = observations.rows(np.sort(order[:: max(1, len(order) // _SCANNED)][:_SCANNED]))
-    best: tuple[float, Projection, float] | None = None
+    best: tuple[float, Projection, float] | None = None  # mean error, projection, angle
     chosen = 0.0
     for projection in projections:
-        around = _FARTHEST_DEG if best is None else _near(best[2])
+        around = _FARTHEST_DEG
+        if best is not None:
+            at = _FARTHEST_DEG.index(best[2])
+            around = _FARTHEST_DEG[max(at - 1, 0) : at + 2]
         for angle in around:
-            focal = _focal(projection, farthest, np.radians(angle))
-            if focal is None:
+            if np.radians(angle) > LIMITS[projection] * 0.98:
                 continue
+            focal = farthest / float(unit_radius(projection, np.asarray(np.radians(angle))))
             state = poses_from_rays(projection, np.array([*centre, focal]), some, reweighted=2)
             score = float(np.mean(median_errors_px(state, some)))
             if best is None or score < best[0]:
@@ -60,18 +63,6 @@ def first_guess(
     if best is None or not np.isfinite(best[0]):
         raise CalibrationError("no lens makes a board of these corners; check --pattern")
     return poses_from_rays(best[1], np.array([*centre, chosen]), observations)
-
-
-def _near(angle_deg: float) -> tuple[float, ...]:
-    at = _FARTHEST_DEG.index(angle_deg)
-    return _FARTHEST_DEG[max(at - 1, 0) : at + 2]
-
-
-def _focal(projection: Projection, radius_px: float, theta: float) -> float | None:
-    """The focal length that puts `theta` at this radius; None beyond the projection's reach."""
-    if theta > LIMITS[projection] * 0.98:
-        return None
-    return radius_px / float(unit_radius(projection, np.asarray(theta)))
 
 
 def median_errors_px(state: CalibrationState, observations: CornerObservations) -> FloatArray:
@@ -111,9 +102,8 @@ def poses_from_rays(
         off = np.arctan2(sine, along)
         size = np.linalg.norm(ahead, axis=1)
         scale = np.nanmedian(np.where(observations.visible, off, np.nan), axis=1, keepdims=True)
-        weight = (
-            observations.visible / (np.maximum(off, scale + 1e-6) * size) / np.maximum(size, 1e-12)
-        )
+        weight = observations.visible / (np.maximum(off, scale + 1e-6) * size)
+        weight = weight / np.maximum(size, 1e-12)
         weight = weight / weight.max(axis=1, keepdims=True)
     first, second, translation = mapped[..., 0] / half, mapped[..., 1] / half, mapped[..., 2]
     length = (np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1)) / 2

@@ -7,6 +7,7 @@ lens predicts images that were not used to fit it. This reveals overfitting.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -145,12 +146,9 @@ def _covariance(adjusted: AdjustmentResult, observations: CornerObservations) ->
     inverted, times the variance of the residuals."""
     state, bent = adjusted.state, adjusted.model.board
     prior = ShapePrior.of(observations, state) if bent else None
-    normal = normal_equations(
-        jacobian(state, observations.flat, bent=bent),
-        adjusted.residuals_px,
-        observations.visible.astype(np.float64),
-        None if prior is None else prior.basis,
-    )
+    basis, visible = None if prior is None else prior.basis, observations.visible.astype(np.float64)
+    jac = jacobian(state, observations.flat, bent=bent)
+    normal = normal_equations(jac, adjusted.residuals_px, visible, basis)
     free = 2 * observations.visible.sum() - 6 * len(observations) - len(state.lens)
     if prior is not None:
         normal = prior.added(normal, state)
@@ -172,42 +170,32 @@ def rms_by_image(error: FloatArray, observations: CornerObservations) -> FloatAr
 
 #: Fewer images than this are refitted for every fold; with more, one linear step is as good.
 _REFIT_BELOW = 10
+_POSE_STEPS = 20
 
 
-@dataclass(frozen=True)
-class LinearizedFit:
-    """The last stage's equations at a fit, which give the fit without some images in one step.
+def _linear_refit(
+    observations: CornerObservations, fitted: AdjustmentResult
+) -> Callable[[BoolArray], CalibrationState]:
+    """Lens and shape fitted to the images `keep` [V] only, and their poses, in one linear step.
 
     With many images a fit moves little when a few are removed, and one undamped Gauss-Newton step
     from the optimum gets there (to 1 % of the held-out error, tested).
     """
+    state, bent = fitted.state, fitted.model.board
+    whole = jacobian(state, observations.flat, bent=bent)
+    whole, weighted_px = whitened(whole, fitted.residuals_px, fitted.sigma_px * SOFT_L1_TURN)
+    visible = observations.visible.astype(np.float64)
+    prior = ShapePrior.of(observations, state) if bent else None
+    basis = None if prior is None else prior.basis
 
-    fitted: AdjustmentResult
-    jac: Jacobian
-    weighted_px: FloatArray
-    visible: FloatArray
-    prior: ShapePrior | None
-
-    @staticmethod
-    def of(observations: CornerObservations, fitted: AdjustmentResult) -> LinearizedFit:
-        jac, weighted_px = whitened(
-            jacobian(fitted.state, observations.flat, bent=fitted.model.board),
-            fitted.residuals_px,
-            fitted.sigma_px * SOFT_L1_TURN,
-        )
-        prior = ShapePrior.of(observations, fitted.state) if fitted.model.board else None
-        visible = observations.visible.astype(np.float64)
-        return LinearizedFit(fitted, jac, weighted_px, visible, prior)
-
-    def without(self, out: BoolArray) -> CalibrationState:
-        """Lens and shape fitted to the images that are not `out` [V], and these images' poses."""
-        keep, state = ~out, self.fitted.state
-        jac = Jacobian(*(part[keep] for part in self.jac.parts))
-        basis = None if self.prior is None else self.prior.basis
-        normal = normal_equations(jac, self.weighted_px[keep], self.visible[keep], basis)
-        if self.prior is not None:
-            normal = self.prior.added(normal, state)
+    def refit(keep: BoolArray) -> CalibrationState:
+        jac = Jacobian(*(part[keep] for part in vars(whole).values()))
+        normal = normal_equations(jac, weighted_px[keep], visible[keep], basis)
+        if prior is not None:
+            normal = prior.added(normal, state)
         return apply_step(state.rows(keep), normal.step(0.0), basis)
+
+    return refit
 
 
 def assign_folds(images: int, folds: int) -> IntArray:
@@ -224,13 +212,13 @@ def held_out_residuals(
 ) -> FloatArray:
     """[V, C, 2] residuals of each image under the lens that the other folds give, pixels."""
     fold = assign_folds(len(observations), folds)
-    linear = LinearizedFit.of(observations, fitted) if len(observations) >= _REFIT_BELOW else None
+    linear = _linear_refit(observations, fitted) if len(observations) >= _REFIT_BELOW else None
     lens = np.empty((len(observations), 1, len(fitted.state.lens)))
     shape = np.empty((len(observations), *fitted.state.shape.shape))
     for number in range(fold.max() + 1):
         out = fold == number
         if linear is not None:
-            train = linear.without(out)
+            train = linear(~out)
         else:
             near = replace(fitted, state=fitted.state.rows(~out))
             train = refit_robust(observations.rows(~out), near)
@@ -239,21 +227,16 @@ def held_out_residuals(
     return residuals(fit_poses(state, observations), observations)
 
 
-def fit_poses(
-    start: CalibrationState, observations: CornerObservations, steps: int = 20
-) -> CalibrationState:
+def fit_poses(start: CalibrationState, observations: CornerObservations) -> CalibrationState:
     """The best poses under the lens and shape of `start`, each image by itself."""
     state = start
     error = residuals(state, observations)
     cost: FloatArray = np.asarray((error * error).sum((1, 2)))
     damping: FloatArray = np.full(len(cost), 1e-8)
     index = np.arange(6)
-    for _ in range(steps):
-        jac = (
-            jacobian(state, observations.flat, bent=False).pose
-            * observations.visible[..., None, None]
-        )
-        tall = jac.reshape(len(cost), -1, 6)
+    for _ in range(_POSE_STEPS):
+        pose = jacobian(state, observations.flat, bent=False).pose
+        tall = (pose * observations.visible[..., None, None]).reshape(len(cost), -1, 6)
         normal = tall.transpose(0, 2, 1) @ tall
         slope = (tall.transpose(0, 2, 1) @ error.reshape(len(cost), -1, 1))[..., 0]
         normal[:, index, index] *= 1 + damping[:, None]

@@ -55,7 +55,6 @@ class CornerObservations:
 
     @staticmethod
     def of(pattern: BoardPattern, views: Sequence[BoardView]) -> CornerObservations:
-        """From views of one size."""
         uv = np.zeros((len(views), pattern.count, 2))
         visible = np.zeros((len(views), pattern.count), np.bool_)
         for row, view in enumerate(views):
@@ -69,19 +68,16 @@ class CornerObservations:
         return len(self.names)
 
     def views(self) -> list[BoardView]:
-        """One view an image."""
         return [
             BoardView(name, np.flatnonzero(visible), uv[visible], self.width, self.height)
             for name, uv, visible in zip(self.names, self.uv_px, self.visible, strict=True)
         ]
 
     def rows(self, keep: BoolArray | IntArray) -> CornerObservations:
-        """Some of the images."""
         names = tuple(str(name) for name in np.array(self.names)[keep])
         return replace(self, names=names, uv_px=self.uv_px[keep], visible=self.visible[keep])
 
     def without(self, wrong: BoolArray) -> CornerObservations:
-        """Without some corners [V, C]."""
         return replace(self, visible=self.visible & ~wrong)
 
     def renumbered(self, source: IntArray) -> CornerObservations:
@@ -131,7 +127,6 @@ class CalibrationState:
     shape: FloatArray
 
     def rows(self, keep: BoolArray | IntArray) -> CalibrationState:
-        """The poses of some of the images."""
         return replace(self, rotation=self.rotation[keep], translation=self.translation[keep])
 
     def radius_px(self, theta: FloatArray) -> FloatArray:

@@ -45,11 +45,6 @@ class Jacobian:
     pose: FloatArray
     shape: FloatArray
 
-    @property
-    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Its arrays, in order."""
-        return self.uv_px, self.lens, self.pose, self.shape
-
 
 def jacobian(state: CalibrationState, flat: FloatArray, *, bent: bool = True) -> Jacobian:
     """The derivatives at `state` for a board that is `flat` [C, 3] plus the state's shape.

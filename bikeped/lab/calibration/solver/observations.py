@@ -25,7 +25,6 @@ from bikeped.lab.calibration.solver.lens_model import (
     camera_points,
 )
 from bikeped.lab.calibration.solver.normal_equations import single_threaded
-from bikeped.types import BoolArray
 
 FEWEST_BOARDS = 3
 #: Boards are alike when none moves by more than this share of its own size.
@@ -85,10 +84,13 @@ def prepare_observations(boards: DetectedBoards) -> PreparedObservations:
         fitted = adjust(observations, flexible, state)
         state = fitted.state
         off_px = np.hypot(fitted.residuals_px[..., 0], fitted.residuals_px[..., 1])
-        wrong = outlier_corners(fitted, observations)
+        bends = _BENDS_SHARE * observations.square_px[:, None]
+        far = np.maximum(bends, max(GROSS_SIGMAS * fitted.sigma_px, GROSS_PX))
+        wrong = observations.visible & (off_px > far)
         if not wrong.any():
             break
-        useless = images_with_few_inliers(observations, wrong)
+        good = (observations.visible & ~wrong).sum(1)
+        useless = (good < FEWEST_CORNERS) | (good < LEAST_SHARE * observations.visible.sum(1))
         median_px = median_errors_px(state, observations)
         names = observations.names
         refused += [
@@ -116,20 +118,6 @@ def prepare_observations(boards: DetectedBoards) -> PreparedObservations:
     return PreparedObservations(
         observations, state, tuple(outliers), tuple(refused), boards.images, boards.images_hash
     )
-
-
-def outlier_corners(fitted: AdjustmentResult, observations: CornerObservations) -> BoolArray:
-    """[V, C] which corners are off by more than noise explains."""
-    off_px = np.hypot(fitted.residuals_px[..., 0], fitted.residuals_px[..., 1])
-    bends = _BENDS_SHARE * observations.square_px[:, None]
-    far = np.maximum(bends, max(GROSS_SIGMAS * fitted.sigma_px, GROSS_PX))
-    return np.asarray(observations.visible & (off_px > far))
-
-
-def images_with_few_inliers(observations: CornerObservations, wrong: BoolArray) -> BoolArray:
-    """[V] which images keep too few corners without the `wrong` ones [V, C]."""
-    good = (observations.visible & ~wrong).sum(1)
-    return np.asarray((good < FEWEST_CORNERS) | (good < LEAST_SHARE * observations.visible.sum(1)))
 
 
 def _check_count(boards: DetectedBoards) -> None:
@@ -185,12 +173,8 @@ def _check_fisheye(observations: CornerObservations, state: CalibrationState) ->
     size = np.array([observations.width - 1, observations.height - 1])
     rim = np.hypot(*np.maximum(centre, size - centre)) / best.state.lens[2]
     theta = float(np.degrees(unit_angle(best.state.projection, np.asarray(rim))))
-    ordinary = adjust(
-        observations,
-        LensModel("perspective"),
-        first_guess(observations, ("perspective",)),
-        robust=False,
-    )
+    start = first_guess(observations, ("perspective",))
+    ordinary = adjust(observations, LensModel("perspective"), start, robust=False)
     fisheye, perspective = (
         float(np.sqrt((fitted.residuals_px**2).sum())) for fitted in (best, ordinary)
     )
