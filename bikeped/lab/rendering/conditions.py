@@ -10,7 +10,15 @@ import numpy as np
 from bikeped.errors import ScenarioError
 from bikeped.types import FloatArray
 
-LIGHTS = ("day", "overcast", "dusk", "night", "glare")
+#: By light: sun, ambient, top and low of the sky (see `Lighting`), haze_m, factor on the noise.
+_LIGHTS = {
+    "day": ((0.66, 0.61, 0.53), (0.46, 0.49, 0.54), (92, 146, 208), (206, 217, 226), 240.0, 1.0),
+    "overcast": ((0, 0, 0), (0.76, 0.77, 0.8), (168, 174, 182), (204, 207, 210), 170.0, 1.0),
+    "dusk": ((0.62, 0.40, 0.22), (0.27, 0.29, 0.38), (72, 92, 142), (222, 166, 122), 240.0, 1.5),
+    "night": ((0, 0, 0), (0.15, 0.16, 0.21), (10, 12, 22), (38, 34, 38), 300.0, 1.7),
+    "glare": ((0.85, 0.78, 0.64), (0.36, 0.37, 0.40), (142, 172, 208), (246, 236, 212), 240.0, 1.0),
+}
+LIGHTS = tuple(_LIGHTS)
 WEATHERS = ("dry", "rain")
 
 
@@ -66,8 +74,7 @@ class Lighting:
     @property
     def shade(self) -> FloatArray:
         """What a shadow leaves of the light on level ground [3]."""
-        level = self.sun * max(float(self.to_sun[2]), 0.0)
-        return np.asarray(self.ambient / np.maximum(self.ambient + level, 1e-6))
+        return np.asarray(self.ambient / np.maximum(self.ground, 1e-6))
 
     @property
     def ground(self) -> FloatArray:
@@ -83,29 +90,21 @@ def lighting(conditions: Conditions) -> Lighting:
     height = math.radians(float(rng.uniform(28, 62)))
     gain = float(rng.uniform(0.88, 1.1))
     warm = float(rng.uniform(-0.03, 0.03))
-    sun, ambient = np.array([0.66, 0.61, 0.53]), np.array([0.46, 0.49, 0.54])
-    top, low = np.array([92.0, 146, 208]), np.array([206.0, 217, 226])
-    clouds, haze, noise, glare = float(rng.uniform(0.1, 0.8)), 240.0, conditions.noise, 0.0
+    clouds, glare = float(rng.uniform(0.1, 0.8)), 0.0
+    *colours, haze, noise_gain = _LIGHTS[kind]
+    sun, ambient, top, low = (np.array(colour, np.float64) for colour in colours)
+    noise = conditions.noise * noise_gain
     if kind == "overcast":
-        sun, ambient = np.zeros(3), np.array([0.76, 0.77, 0.8])
-        top, low = np.array([168.0, 174, 182]), np.array([204.0, 207, 210])
-        clouds, haze = 0.5, 170.0
+        clouds = 0.5
     elif kind == "dusk":
         height = math.radians(float(rng.uniform(7, 16)))
-        sun, ambient = np.array([0.62, 0.40, 0.22]), np.array([0.27, 0.29, 0.38])
-        top, low = np.array([72.0, 92, 142]), np.array([222.0, 166, 122])
-        noise *= 1.5
     elif kind == "night":
         # A crossing is lit and a camera raises its gain: everyone can be made out on a close look.
-        sun, ambient = np.zeros(3), np.array([0.15, 0.16, 0.21]) * float(rng.uniform(1.2, 1.8))
-        top, low, clouds, haze = np.array([10.0, 12, 22]), np.array([38.0, 34, 38]), 0.15, 300.0
-        noise *= 1.7
+        ambient, clouds = ambient * float(rng.uniform(1.2, 1.8)), 0.15
     elif kind == "glare":
         # In the picture: within 50 degrees of north, the default camera's heading, and low.
         azimuth = math.radians(90 + float(rng.uniform(-50, 50)))
         height = math.radians(float(rng.uniform(9, 24)))
-        sun, ambient = np.array([0.85, 0.78, 0.64]), np.array([0.36, 0.37, 0.40])
-        top, low = np.array([142.0, 172, 208]), np.array([246.0, 236, 212])
         glare = float(rng.uniform(0.6, 1.0))
     if wet:
         sun = sun * 0.12

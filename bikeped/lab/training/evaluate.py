@@ -199,14 +199,12 @@ def evaluate(
         },
         {
             "area_input_px": INPUT_PX,
-            "confidence": settings.confidence,
-            "iou": settings.iou,
-            "least_objects": settings.least_objects,
+            **asdict(settings),
             "deployed_confidence": detection.confidence,
             "deployed_iou": detection.iou,
             "rider_overlap": detection.rider_overlap,
         },
-        tuple(its.score(truths, names, len(data.images), settings) for its in gathered),
+        tuple(its.score(truths, names, len(data.images)) for its in gathered),
     )
 
 
@@ -232,7 +230,7 @@ def write_curve(path: Path, curve: RecallCurve, at_iou_50: bool = False) -> None
 
 
 _NONE = np.zeros(0, np.int64)
-_EMPTY = DetectionSet(_NONE, _NONE, np.zeros((0, 4)), np.zeros(0, np.float32))
+_EMPTY = (_NONE, _NONE, np.zeros((0, 4)), np.zeros(0, np.float32))
 
 
 class _ModelResults:
@@ -246,14 +244,13 @@ class _ModelResults:
         detection: DetectionConfig,
         settings: EvaluationSettings,
     ) -> None:
-        self._model = model
-        self._iou = settings.iou
+        self._model, self._settings = model, settings
         names = model.detector.class_names
         place = {plain_name(data.categories[category]): n for n, category in enumerate(shared)}
         kinds = kinds_by_name(dict(enumerate(names)), detection)
         self._class_of = np.array([place.get(plain_name(name), -1) for name in names], np.int64)
         self._kind_of = np.array([int(kinds.get(n, -1)) for n in range(len(names))], np.int64)
-        self._found: tuple[list[DetectionSet], ...] = ([_EMPTY], [_EMPTY], [_EMPTY])
+        self._found: tuple[list[tuple[Any, ...]], ...] = ([_EMPTY], [_EMPTY], [_EMPTY])
 
     def add(self, image: int, users: Detections, every: Candidates, scale: float) -> None:
         """Adds one picture's detections; `scale` is from its pixels to the network's input."""
@@ -262,24 +259,24 @@ class _ModelResults:
             group = group_of[every.class_id]
             wanted = group >= 0
             box, score, group = every.box[wanted], every.score[wanted], group[wanted]
-            keep = non_max_suppression(box, score, group, self._iou, _MAX_DETECTIONS)
+            keep = non_max_suppression(box, score, group, self._settings.iou, _MAX_DETECTIONS)
             groups.append((group[keep], box[keep], score[keep]))
         groups.append((users.kind.astype(np.int64), users.box_px, users.confidence))
         for found, (group, box, score) in zip(self._found, groups, strict=True):
             number = np.full(len(score), image, np.int64)
-            scaled = (box * scale).astype(np.float64)
-            found.append(DetectionSet(number, group, scaled, score))
+            found.append((number, group, (box * scale).astype(np.float64), score))
 
     def score(
-        self,
-        truths: tuple[GroundTruth, GroundTruth, GroundTruth],
-        names: Sequence[str],
-        images: int,
-        settings: EvaluationSettings,
+        self, truths: Sequence[GroundTruth], names: Sequence[str], images: int
     ) -> ModelScores:
         """Measures everything that was added."""
-        found = [_concatenated(parts) for parts in self._found]
-        users, least = measure(truths[2], found[2], KIND_NAMES, images), settings.least_objects
+        found = [
+            DetectionSet(*map(np.concatenate, zip(*rows, strict=True))) for rows in self._found
+        ]
+        users, least = (
+            measure(truths[2], found[2], KIND_NAMES, images),
+            self._settings.least_objects,
+        )
         detector = self._model.detector
         return ModelScores(
             self._model.label,
@@ -296,12 +293,3 @@ class _ModelResults:
             {k.label: recall_curve(truths[2], users.hits, least, int(k)) for k in Kind},
             {kind.label: recall_by_distance(truths[2], users.hits, int(kind)) for kind in Kind},
         )
-
-
-def _concatenated(parts: Sequence[DetectionSet]) -> DetectionSet:
-    return DetectionSet(
-        np.concatenate([part.image for part in parts]),
-        np.concatenate([part.category for part in parts]),
-        np.concatenate([part.box_px for part in parts]),
-        np.concatenate([part.score for part in parts]),
-    )

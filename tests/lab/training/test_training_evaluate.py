@@ -19,7 +19,7 @@ from bikeped.lab.rendering.dataset import write_dataset
 from bikeped.lab.simulation.perception import AREA_SCALE
 from bikeped.lab.training.coco import read_coco
 from bikeped.lab.training.evaluate import EvaluationSettings, ModelUnderTest, evaluate, load_models
-from bikeped.lab.training.evaluation_figures import draw_evaluation, evaluation_rows
+from bikeped.lab.training.evaluation_report import draw_evaluation, evaluation_rows
 from bikeped.lab.training.measures import INPUT_PX
 
 CPU = DetectionConfig(providers=("cpu",), threads=1)

@@ -1,4 +1,4 @@
-"""The evaluation drawn: precision and recall side by side, and recall against area."""
+"""An evaluation as tables, and drawn: precision and recall side by side, recall against area."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bikeped.lab.plotting import SERIES, FigureSheet, escape_dollars, to_floats
-from bikeped.lab.training.evaluate import Evaluation, ModelScores
+from bikeped.lab.result_tables import CellValue, ResultTable
+from bikeped.lab.training.evaluate import KIND_NAMES, Evaluation, ModelScores
 from bikeped.lab.training.measures import ClassMeasures
 
 _TICKS = (4, 8, 16, 32, 64, 96, 128, 256, 512, 1024)  # sides of squares on the axis of areas
@@ -23,6 +24,93 @@ def evaluation_rows(score: ModelScores) -> list[tuple[str, ClassMeasures]]:
     rows += [(f"{row.name}, merged", row) for row in score.merged.rows]
     rows += [(f"{row.name}, as deployed", row) for row in score.road_users.rows]
     return rows
+
+
+def evaluation_tables(result: Evaluation) -> list[ResultTable]:
+    """The paper's detection table, by size, and by class where there is more than one."""
+    rows = [evaluation_rows(score) for score in result.scores]
+    data = result.data
+    unknown = data["categories_not_known_to_every_model"]
+    note = f"{data['images']} pictures, {data['objects']} objects"
+    if unknown:
+        some = ", ".join(unknown[:6]) + (", ..." if len(unknown) > 6 else "")
+        note += f"; classes left out, as not every model has them: {some}"
+    main = ResultTable("detection", "detection", *_compared(result, rows), note)
+    sizes = ResultTable(
+        "by_size",
+        "recall by area at the network's input: small < 32^2, medium < 96^2, large",
+        ("", *(f"{s.label} {n}" for s in result.scores for n in ("small", "medium", "large"))),
+        [
+            (name, *(_three(v) for score in rows for v in score[index][1].ar_by_size))
+            for index, (name, _) in enumerate(rows[0])
+        ],
+    )
+    found = [main, sizes, _false_positives(result)]
+    if any(row for score in result.scores for row in score.by_distance.values()):
+        found.append(_distances(result))
+    if all(score.classes is not None for score in result.scores):
+        by_class = [
+            [(row.name, row) for row in score.classes.rows if row.objects]
+            for score in result.scores
+            if score.classes is not None
+        ]
+        if len(by_class[0]) > 1:
+            found.append(ResultTable("classes", "by class", *_compared(result, by_class)))
+    return found
+
+
+def _false_positives(result: Evaluation) -> ResultTable:
+    pictures = result.data["images"]
+    return ResultTable(
+        "false",
+        "as deployed: false boxes per 100 pictures (IoU below 0.50 with anything)",
+        ("", *KIND_NAMES),
+        [
+            (score.label, *(round(100 * count / pictures, 2) for count in score.road_users.false))
+            for score in result.scores
+        ],
+    )
+
+
+def _distances(result: Evaluation) -> ResultTable:
+    """Recall against distance, where the data record it."""
+    first = result.scores[0].by_distance
+    lines: list[tuple[CellValue, ...]] = []
+    for kind, rows in first.items():
+        for index, row in enumerate(rows):
+            end = "" if row["to_m"] is None else f"{row['to_m']:g}"
+            own = [_three(s.by_distance[kind][index]["recall50"]) for s in result.scores]
+            lines.append((kind, f"{row['from_m']:g} to {end}".strip(), row["objects"], *own))
+    return ResultTable(
+        "distance",
+        "as deployed: recall at IoU 0.50 by distance",
+        ("", "distance, m", "objects", *(score.label for score in result.scores)),
+        lines,
+    )
+
+
+def _compared(
+    result: Evaluation, rows: list[list[tuple[str, ClassMeasures]]]
+) -> tuple[tuple[str, ...], list[tuple[CellValue, ...]]]:
+    """Columns and rows: AP, AP50 and recall of each model, and AP against the first model's."""
+    columns = ["", "objects"]
+    for number, score in enumerate(result.scores):
+        columns += [f"{score.label} AP", "AP50", "recall"] + (["AP ratio"] if number else [])
+    lines: list[tuple[CellValue, ...]] = []
+    for index, (name, first) in enumerate(rows[0]):
+        line: list[CellValue] = [name, first.objects]
+        for number, own in enumerate(rows):
+            row = own[index][1]
+            line += [_three(row.ap), _three(row.ap50), _three(row.ar)]
+            if number:
+                both = row.ap is not None and first.ap
+                line.append(round(row.ap / first.ap, 2) if both else None)  # type: ignore[operator]
+        lines.append(tuple(line))
+    return tuple(columns), lines
+
+
+def _three(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
 
 
 def draw_evaluation(evaluation: Evaluation, path: Path) -> list[Path]:
