@@ -1,0 +1,1 @@
+"""Desk tools: simulation, experiments, calibration, training, test bench. Never on the pole."""

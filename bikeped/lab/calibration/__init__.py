@@ -1,1 +1,1 @@
-"""From checkerboard pictures to a lens that one can trust (paper, section on calibration)."""
+"""Lens calibration from checkerboard images (paper, section on calibration)."""

@@ -1,0 +1,1 @@
+"""Commands of the lab: one thin module a command or group."""
