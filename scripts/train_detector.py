@@ -38,7 +38,12 @@ from bikeped.lab.training.augment import AugmentSettings, augment_data
 from bikeped.lab.training.coco import read_coco
 from bikeped.lab.training.crops import CropSettings
 from bikeped.lab.training.drawn import DrawnSettings, draw_training_set
-from bikeped.lab.training.export import export_network
+from bikeped.lab.training.export import (
+    CALIBRATION_IMAGES,
+    calibration_images,
+    export_network,
+    quantise,
+)
 from bikeped.lab.training.fit import FitSettings, fit
 from bikeped.lab.training.hard_negative_mining import MINING_ROUNDS, MiningSettings
 from bikeped.lab.training.model_card import (
@@ -59,7 +64,6 @@ from bikeped.lab.training.network import (
     shift_scores,
 )
 from bikeped.lab.training.packing import PackSettings
-from bikeped.lab.training.quantise import CALIBRATION_IMAGES, calibration_images, quantise
 from bikeped.lab.training.small import SmallTrainSettings, supports_bfloat16, train_small
 from bikeped.lab.training.warp import WarpRanges
 from bikeped.models import BUNDLED_FILE

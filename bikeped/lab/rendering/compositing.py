@@ -148,12 +148,11 @@ def _tiled(
     size_y, size_x = tile.shape[:2]
     for top in range(-offset[0] % size_y - size_y, height, size_y):
         for left in range(-offset[1] % size_x - size_x, width, size_x):
-            y0, x0 = max(top, 0), max(left, 0)
-            y1, x1 = min(top + size_y, height), min(left + size_x, width)
-            if y1 <= y0 or x1 <= x0:
-                continue
-            part = image[y0:y1, x0:x1]
-            operation(part, tile[y0 - top : y1 - top, x0 - left : x1 - left], part)
+            spot = overlapping_slices((width, height), left, top, size_x, size_y)
+            if spot is not None:
+                rows, columns, tile_rows, tile_columns = spot
+                part = image[rows, columns]
+                operation(part, tile[tile_rows, tile_columns], part)
 
 
 @lru_cache(maxsize=8)

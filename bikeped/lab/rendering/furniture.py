@@ -15,11 +15,7 @@ from bikeped.types import FloatArray
 _STEEL: Rgb = (96, 100, 106)
 LAMP_HEAD_M = (1.6, 5.9)  #: how far over the road and how high a street lamp shines
 #: Length and width of what stands on the ground.
-FOOTPRINT_M: dict[str, tuple[float, float]] = {
-    "car": (4.5, 1.8),
-    "bin": (0.5, 0.5),
-    "tree": (0.5, 0.5),
-}
+FOOTPRINT_M = {"car": (4.5, 1.8), "bin": (0.5, 0.5), "tree": (0.5, 0.5)}
 POLE_FOOTPRINT_M = (0.2, 0.2)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.geometry import CameraPose
-from bikeped.lab.rendering.sprite import Sprite, overlapping_slices, sprites_overlap
+from bikeped.lab.rendering.sprite import Sprite, overlapping_slices
 from bikeped.types import BoolArray, Float32Array, FloatArray, Kind
 
 #: What each kind of agent counts as: the default configuration's classes.
@@ -71,7 +71,7 @@ def label(
     left: list[Float32Array | None] = []
     for i, near in enumerate(occluders):
         for far, cover in zip(occluders[:i], left, strict=True):
-            if cover is not None and sprites_overlap(far.sprite, near.sprite):
+            if cover is not None:
                 _hide(cover, far.sprite, near.sprite)
         whole = np.asarray(near.sprite.alpha, np.float32) / np.float32(255)
         left.append(whole if near.kind is not None else None)
@@ -86,12 +86,11 @@ def label(
 def _hide(cover: Float32Array, far: Sprite, near: Sprite) -> None:
     """Takes from `far`'s coverage what `near` covers."""
     height, width = cover.shape
-    x0, y0 = max(near.left - far.left, 0), max(near.top - far.top, 0)
-    x1 = min(near.left + near.alpha.shape[1] - far.left, width)
-    y1 = min(near.top + near.alpha.shape[0] - far.top, height)
-    dx, dy = far.left - near.left, far.top - near.top
-    over = near.alpha[y0 + dy : y1 + dy, x0 + dx : x1 + dx]
-    cover[y0:y1, x0:x1] *= 1 - over.astype(np.float32) / 255
+    left, top = near.left - far.left, near.top - far.top
+    spot = overlapping_slices((width, height), left, top, near.alpha.shape[1], near.alpha.shape[0])
+    if spot is not None:
+        rows, columns, near_rows, near_columns = spot
+        cover[rows, columns] *= 1 - near.alpha[near_rows, near_columns].astype(np.float32) / 255
 
 
 def _label(

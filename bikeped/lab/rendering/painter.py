@@ -251,6 +251,5 @@ def _blocks_path(what: str, xy: tuple[float, float], paths: FloatArray) -> bool:
     """Whether an agent's path leads through this fixture."""
     apart = np.abs(paths - np.array(xy))
     if what == "car":
-        near = (apart[:, 0] < 2.4 + _PATH_CLEAR_M) & (apart[:, 1] < 0.95 + _PATH_CLEAR_M)
-        return bool(near.any())
-    return bool((np.hypot(apart[:, 0], apart[:, 1]) < _PATH_CLEAR_M).any())
+        return bool((apart < np.array([2.4, 0.95]) + _PATH_CLEAR_M).all(axis=1).any())
+    return bool((np.hypot(*apart.T) < _PATH_CLEAR_M).any())

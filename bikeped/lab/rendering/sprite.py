@@ -150,12 +150,8 @@ def _filled(
 def sprites_overlap(one: Sprite, other: Sprite) -> bool:
     """Whether two sprites' rectangles overlap."""
     (h, w), (k, v) = one.alpha.shape, other.alpha.shape
-    return (
-        one.left < other.left + v
-        and other.left < one.left + w
-        and one.top < other.top + k
-        and other.top < one.top + h
-    )
+    left, top = other.left - one.left, other.top - one.top
+    return overlapping_slices((w, h), left, top, v, k) is not None
 
 
 def overlapping_slices(

@@ -23,9 +23,8 @@ from bikeped.detection.nms import iou_matrix
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.training.coco import FALSE_POSITIVE, CocoData, CocoImage, furniture
 from bikeped.lab.training.crops import reduced_picture
-from bikeped.lab.training.export import export_network
+from bikeped.lab.training.export import calibration_images, export_network, quantise
 from bikeped.lab.training.network import SmallDetector, SmallNet
-from bikeped.lab.training.quantise import calibration_images, quantise
 from bikeped.types import Float32Array, FloatArray, Kind
 
 #: Shares of the steps: while learning is fast, and again before the plain windows.

@@ -12,9 +12,8 @@ from bikeped.config.schema import DetectionConfig  # noqa: E402
 from bikeped.detection import load_detector  # noqa: E402
 from bikeped.errors import DetectorError  # noqa: E402
 from bikeped.lab.training.coco import read_coco  # noqa: E402
-from bikeped.lab.training.export import export_network  # noqa: E402
+from bikeped.lab.training.export import calibration_images, export_network, quantise  # noqa: E402
 from bikeped.lab.training.network import SmallDetector, SmallNet  # noqa: E402
-from bikeped.lab.training.quantise import calibration_images, quantise  # noqa: E402
 
 ort = pytest.importorskip("onnxruntime")
 SIZE = (128, 96)
