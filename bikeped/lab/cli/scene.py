@@ -137,7 +137,8 @@ def command(
             f"wrote {out}: {summary['frames']} frames of {size}, {summary['duration_s']:.1f} s; "
             f"boxes in {summary['boxes']}"
         )
-    report(summary, json_path, _shown(summary, line))
+    head = {"scenario": found.name, "size": list(size_wh)}
+    report(head | summary, json_path, _shown(summary, line))
 
 
 def _clip(
@@ -156,12 +157,10 @@ def _clip(
         for item in frame:
             seen.setdefault(item.kind, set()).add(item.id)
     return {
-        "scenario": painter.scenario.name,
         "clip": str(out),
         "boxes": str(sidecar),
         "frames": len(truth.frames),
         "duration_s": round(len(truth.frames) / fps, 3),
-        "size": list(painter.camera.size),
         "conditions": truth.header["conditions"],
         "seen": {kind: len(ids) for kind, ids in sorted(seen.items())},
     }
@@ -185,10 +184,8 @@ def _still(painter: ScenePainter, t: float, path: Path, *, boxes: bool) -> dict[
         raise BikepedError(f"{path}: the picture could not be encoded; try a .png name")
     write_whole(path, data.tobytes())
     return {
-        "scenario": painter.scenario.name,
         "still": str(path),
         "t": t,
-        "size": list(painter.camera.size),
         "objects": [
             {
                 "id": item.id,

@@ -74,7 +74,11 @@ class ScenePainter:
             s for s in self.backdrop.standing if not _blocks_path(s.item.what, s.item.xy_m, paths)
         ]
         standing.sort(key=lambda s: -s.sprite.distance_m)
-        self._fixtures = [_SceneItem(_fixed(s, -1 - i)) for i, s in enumerate(standing)]
+        self._fixtures = []
+        for i, s in enumerate(standing):
+            kind = "car" if s.item.what == "car" else None
+            place = np.array(s.item.xy_m), s.item.heading_rad
+            self._fixtures.append(_SceneItem(Occluder(s.sprite, -1 - i, kind, *place)))
         width, height = camera.size
         self._furniture: list[tuple[str, Box]] = [
             (s.item.what, s.sprite.full_box_px)
@@ -221,12 +225,6 @@ class ScenePainter:
 
 def _touches(box: Box, width: int, height: int) -> bool:
     return box[0] < width and box[1] < height and box[2] > 0 and box[3] > 0
-
-
-def _fixed(standing: FixtureSprite, number: int) -> Occluder:
-    item = standing.item
-    kind = "car" if item.what == "car" else None
-    return Occluder(standing.sprite, number, kind, np.array(item.xy_m), item.heading_rad)
 
 
 def _travel(agent: Agent, t: float) -> tuple[float, bool]:

@@ -7,7 +7,7 @@ windows are cut from it, most of them around an object. All depends on the seed 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -186,9 +186,7 @@ class Cropper:
         if random.random() < self._settings.cover and len(crop.box_px):
             _occlude(crop, random)
         if random.random() < self._settings.light:
-            return Crop(
-                self._relight(crop.rgb, random), crop.box_px, crop.class_id, crop.ignored_px
-            )
+            return replace(crop, rgb=self._relight(crop.rgb, random))
         return crop
 
     def _corner(

@@ -114,7 +114,9 @@ def drawn_test(
         if region not in detectors:
             detectors[region] = [load_detector(model, Path("/"), region) for model in models]
         for detector, rows in zip(detectors[region], seen, strict=True):
-            rows.append(match_detections(_detect(detector, jpeg, view), objects, view))
+            rgb = JpegDecoder(1).decode(jpeg, *detector.decode_size(*view.size))
+            found = detector.infer(rgb, *view.size).detections
+            rows.append(match_detections(found, objects, view))
         lights.append("rain" if conditions.weather == "rain" else conditions.light)
         progress(len(lights))
     return seen, lights
@@ -222,12 +224,6 @@ def _part(loaded: LoadedConfig, test: DrawnTest, number: int, count: int) -> lis
     return [
         (encode_jpeg(one.image, _QUALITY), one.objects, one.camera, one.conditions) for one in drawn
     ]
-
-
-def _detect(detector: Detector, jpeg: bytes, view: SceneCamera) -> Detections:
-    width, height = view.size
-    rgb = JpegDecoder(1).decode(jpeg, *detector.decode_size(width, height))
-    return detector.infer(rgb, width, height).detections
 
 
 def match_detections(

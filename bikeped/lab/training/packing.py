@@ -65,9 +65,17 @@ class SamplingPool:
 
     @classmethod
     def of(cls, pool: Sequence[Sample]) -> SamplingPool:
-        furniture = _by_kind(pool)
-        false_positives = furniture.pop(FALSE_POSITIVE, [])
-        return cls(_by_class(pool), furniture, false_positives)
+        most = max((int(v.class_id.max()) for v in pool if len(v.class_id)), default=-1)
+        by_class: list[list[_Target]] = [[] for _ in range(most + 1)]
+        things: dict[str, list[_Target]] = {}
+        for number, sample in enumerate(pool):
+            for index in np.flatnonzero(sample.crowd == 0).tolist():
+                weighted = [(number, index)] * sample.sampling_weight(index)
+                by_class[int(sample.class_id[index])].extend(weighted)
+            for what, boxes in sample.furniture_px.items():
+                things.setdefault(what, []).extend((number, index) for index in range(len(boxes)))
+        false_positives = things.pop(FALSE_POSITIVE, [])
+        return cls(by_class, things, false_positives)
 
 
 class Packer:
@@ -105,9 +113,7 @@ class Packer:
         """A window around a random target; None for one at another picture's object."""
         settings = self._settings
         if targets.false_positives and random.random() < settings.mistaken:
-            number, index = targets.false_positives[
-                int(random.integers(len(targets.false_positives)))
-            ]
+            number, index = _one_of(targets.false_positives, random)
             return self._object_window(pool[number], pool[number].false_positive_px[index], random)
         what = random.random() - settings.empty
         if what < 0:
@@ -175,26 +181,6 @@ def first_fit(free: BoolArray, blocks: int) -> tuple[int, int, int] | None:
         return None
     square, row, column = np.unravel_index(found[0], fits.shape)
     return int(square), int(row), int(column)
-
-
-def _by_class(pool: Sequence[Sample]) -> list[list[_Target]]:
-    """Index of the sample and index there of every object, by class."""
-    most = max((int(v.class_id.max()) for v in pool if len(v.class_id)), default=-1)
-    found: list[list[_Target]] = [[] for _ in range(most + 1)]
-    for number, sample in enumerate(pool):
-        for index in np.flatnonzero(sample.crowd == 0).tolist():
-            weighted = [(number, index)] * sample.sampling_weight(index)
-            found[int(sample.class_id[index])].extend(weighted)
-    return found
-
-
-def _by_kind(pool: Sequence[Sample]) -> dict[str, list[_Target]]:
-    """Index of the sample and index there of every fixture, by kind."""
-    found: dict[str, list[_Target]] = {}
-    for number, sample in enumerate(pool):
-        for what, boxes in sample.furniture_px.items():
-            found.setdefault(what, []).extend((number, index) for index in range(len(boxes)))
-    return found
 
 
 def _assembled(tiles: list[tuple[int, int, Crop]], side: int) -> Crop:
