@@ -19,7 +19,6 @@ from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.lab.calibration.capture.images import load_images
 from bikeped.lab.calibration.image_pipeline import detect_boards
 from bikeped.lab.calibration.solver.bundle_adjustment import adjust
-from bikeped.lab.calibration.solver.initial_guess import first_guess
 from bikeped.lab.calibration.solver.lens_model import (
     CalibrationState,
     CornerObservations,
@@ -32,7 +31,7 @@ from bikeped.lab.calibration.solver.model_comparison import (
     fit_models,
     recommend_model,
 )
-from bikeped.lab.calibration.solver.observations import prepare_observations
+from bikeped.lab.calibration.solver.observations import first_guess, prepare_observations
 
 _PICTURES = Path(__file__).parents[3] / "shared" / "media" / "fisheye-checkerboard"
 _PATTERN = BoardPattern(8, 6)

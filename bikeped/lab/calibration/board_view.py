@@ -52,12 +52,6 @@ class BoardView:
     width: int
     height: int
 
-    def __post_init__(self) -> None:
-        if self.uv_px.shape != (len(self.ids), 2):
-            raise ValueError(
-                f"BoardView.uv_px: expected shape ({len(self.ids)}, 2), got {self.uv_px.shape}"
-            )
-
     def __len__(self) -> int:
         return len(self.ids)
 

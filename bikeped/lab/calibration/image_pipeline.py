@@ -82,8 +82,19 @@ def detect_boards(
             refused.append(board)
             continue
         try:
-            _check_sharp(board, usual_px)
-            _check_new(image, board, kept)
+            wide = board.blur_px > max(_BLURRED_PX, _BLURRED_TIMES * usual_px)
+            if wide or board.blur_px >= max(_BLURRED_SQUARE * board.spacing_px, 1.0):
+                raise BoardRefusedError(
+                    f"blurred: its edges are {2 * board.blur_px:.1f} px wide (usual here: "
+                    f"{2 * usual_px:.1f}); take it again with the board held still"
+                )
+            for other, known in kept:
+                shift_px = rms_shift_px(board, known, 0.8 * min(len(board.ids), len(known.ids)))
+                if shift_px < _SAME_PX:
+                    raise BoardRefusedError(f"same picture as {other.name}")
+                moving = image.moving and other.moving
+                if moving and shift_px < _SAME_MOVING * image.width:
+                    raise BoardRefusedError(f"the board has not moved since {other.name}")
             if not whole_seen:
                 # 7x6 corners whose far edge is out of sight look like 8x6 that lack a column.
                 raise BoardRefusedError(
@@ -103,28 +114,6 @@ def _shows_outer_lines(board: DetectedBoard, pattern: BoardPattern) -> bool:
     column, row = board.ids % pattern.columns, board.ids // pattern.columns
     wide = column.min() == 0 and column.max() == pattern.columns - 1
     return bool(wide and row.min() == 0 and row.max() == pattern.rows - 1)
-
-
-def _check_sharp(board: DetectedBoard, usual_px: float) -> None:
-    wide = board.blur_px > max(_BLURRED_PX, _BLURRED_TIMES * usual_px)
-    if wide or board.blur_px >= max(_BLURRED_SQUARE * board.spacing_px, 1.0):
-        raise BoardRefusedError(
-            f"blurred: its edges are {2 * board.blur_px:.1f} px wide (usual here: "
-            f"{2 * usual_px:.1f}); take it again with the board held still"
-        )
-
-
-def _check_new(
-    image: CalibrationImage,
-    board: DetectedBoard,
-    kept: Sequence[tuple[CalibrationImage, DetectedBoard]],
-) -> None:
-    for other, known in kept:
-        shift_px = rms_shift_px(board, known, 0.8 * min(len(board.ids), len(known.ids)))
-        if shift_px < _SAME_PX:
-            raise BoardRefusedError(f"same picture as {other.name}")
-        if image.moving and other.moving and shift_px < _SAME_MOVING * image.width:
-            raise BoardRefusedError(f"the board has not moved since {other.name}")
 
 
 def crop_view(view: BoardView, framing: Framing) -> BoardView:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,16 +28,13 @@ from bikeped.lab.calibration.capture.images import CalibrationImage
 from bikeped.lab.calibration.capture.live_session import LiveSession, capture_boards, live_page
 from bikeped.lab.calibration.corners.candidates import assumed_lens
 from bikeped.lab.calibration.image_pipeline import detect_boards
-from bikeped.lab.calibration.report.field_of_view import (
-    brightest_pixels,
-    circle_radius_px,
-    field_of_view,
-)
 from bikeped.lab.calibration.report.results import (
     MODEL_COLUMNS,
     CalibrationResult,
     calibration_cautions,
     calibration_data,
+    circle_radius_px,
+    field_of_view,
     model_row,
     result_data,
     write_calibration,
@@ -116,7 +114,7 @@ def run(
     recommended = options.compare and not named
     chosen = comparison.fits[recommendation.name if recommended else model.name]
     some = images[:: max(1, len(images) // _CIRCLE_IMAGES)][:_CIRCLE_IMAGES]
-    bright = brightest_pixels(image.grey() for image in some)
+    bright = functools.reduce(np.maximum, (image.grey() for image in some))
     offset = (0, 0) if framed is None else framed.offset_px
     window = (0.0, 0.0, float(size[0]), float(size[1])) if framed is None else framed.window_px
     circle_px = circle_radius_px(bright, chosen.state.lens[:2] - offset)

@@ -17,7 +17,6 @@ from bikeped.lab.calibration.solver import bundle_adjustment as adjust_module
 from bikeped.lab.calibration.solver import lens_fit as validate_module
 from bikeped.lab.calibration.solver.board_shape import gauge_basis
 from bikeped.lab.calibration.solver.bundle_adjustment import AdjustmentStage, adjust, minimise
-from bikeped.lab.calibration.solver.initial_guess import first_guess, median_errors_px
 from bikeped.lab.calibration.solver.lens_fit import (
     assign_folds,
     fit_lens,
@@ -26,7 +25,11 @@ from bikeped.lab.calibration.solver.lens_fit import (
 )
 from bikeped.lab.calibration.solver.lens_model import CornerObservations, LensModel, residuals
 from bikeped.lab.calibration.solver.model_comparison import initial_state
-from bikeped.lab.calibration.solver.observations import prepare_observations
+from bikeped.lab.calibration.solver.observations import (
+    first_guess,
+    median_errors_px,
+    prepare_observations,
+)
 
 HEIGHT_M = 3.6576
 K = (0.004, -0.008, 0.002, -0.0003)

@@ -12,9 +12,7 @@ from synthetic_boards import BoardBend
 
 from bikeped.geometry.lens import Projection, unit_radius
 from bikeped.lab.calibration.capture.coverage import Coverage
-from bikeped.lab.calibration.report.field_of_view import field_of_view
-from bikeped.lab.calibration.report.results import CalibrationResult, result_data
-from bikeped.lab.calibration.solver.initial_guess import FISHEYE
+from bikeped.lab.calibration.report.results import CalibrationResult, field_of_view, result_data
 from bikeped.lab.calibration.solver.lens_fit import LensFit
 from bikeped.lab.calibration.solver.lens_model import LensModel, corner_angles
 from bikeped.lab.calibration.solver.model_comparison import (
@@ -25,7 +23,7 @@ from bikeped.lab.calibration.solver.model_comparison import (
     paper_criterion,
     recommend_model,
 )
-from bikeped.lab.calibration.solver.observations import prepare_observations
+from bikeped.lab.calibration.solver.observations import FISHEYE, prepare_observations
 
 WINDOW = (0.0, 0.0, 1000.0, 1000.0)
 

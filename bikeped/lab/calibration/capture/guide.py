@@ -7,7 +7,7 @@ No camera, clock or screen in here: frames and their times come in, verdicts com
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -48,27 +48,25 @@ class FrameVerdict:
     uv_px: FloatArray
 
 
+@dataclass
 class CaptureGuide:
     """Keeps sharp, new and well-spread boards of one camera. One thread at a time.
 
     `lens` and `centre_px` may be approximate: they only locate a board in the circle.
     """
 
-    def __init__(
-        self,
-        pattern: BoardPattern,
-        width: int,
-        height: int,
-        lens: Lens,
-        centre_px: tuple[float, float],
-    ) -> None:
-        check_pattern(pattern)
-        self.pattern, self.width, self.height = pattern, width, height
-        self.lens, self.centre_px = lens, centre_px
-        self.kept: list[BoardView] = []
+    pattern: BoardPattern
+    width: int
+    height: int
+    lens: Lens
+    centre_px: tuple[float, float]
+    kept: list[BoardView] = field(default_factory=list, init=False)
+    _last: tuple[float, DetectedBoard] | None = field(default=None, init=False)
+    _sharpest_px: float = field(default=float("inf"), init=False)
+
+    def __post_init__(self) -> None:
+        check_pattern(self.pattern)
         self.coverage: Coverage = self._measure()
-        self._last: tuple[float, DetectedBoard] | None = None
-        self._sharpest_px = float("inf")
 
     @property
     def enough(self) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import itertools
 import queue
 import threading
 from collections.abc import Callable, Iterator
@@ -152,10 +153,9 @@ def draw_frame(grey: ImageArray, verdict: FrameVerdict, guide: CaptureGuide) -> 
 
 
 def _save(frame: Frame, folder: Path) -> Path:
-    number = 1
-    while any(folder.glob(f"board-{number:03d}.*")):
-        number += 1
-    path = folder / f"board-{number:03d}.{'png' if frame.jpeg is None else 'jpg'}"
+    names = (f"board-{number:03d}" for number in itertools.count(1))
+    name = next(name for name in names if not any(folder.glob(f"{name}.*")))
+    path = folder / f"{name}.{'png' if frame.jpeg is None else 'jpg'}"
     if frame.jpeg is not None:
         write_whole(path, bytes(frame.jpeg))
     else:

@@ -1,9 +1,7 @@
 """The board of one image: detectors in order of cost, each candidate checked and refined.
 
 The first detector whose candidate passes the checks decides. Where none finds a whole board, a grid
-is grown from the visible corners. It counts from anywhere: its place on the board is known when it
-has all columns and all rows, or where the squares of an outer edge are followed by the paper's
-white margin. Any other image is refused, with the reason: the ids would be a guess.
+is grown from the visible corners, and `corner_ids` finds its place on the board.
 """
 
 from __future__ import annotations

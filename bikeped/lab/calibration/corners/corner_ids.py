@@ -40,10 +40,16 @@ def assign_corner_ids(grey: ImageArray, pattern: BoardPattern, grid: CornerGrid)
     size = _GridBounds.of(grid, 1).size
     if not ((size <= wanted).all() or (size[::-1] <= wanted).all()):
         raise BoardRefusedError(larger_board(pattern, size))
-    orientations: list[_Orientation] = []
+    # Positions [n, 2] (column, row) on the board, whether the outer square beyond corner 0 is dark,
+    # as it must be, and how many columns and rows are in sight: with fewer than all, an outer edge
+    # placed them.
+    orientations: list[tuple[IntArray, bool, IntArray]] = []
     reasons: list[str] = []
+    turned = grid
     for turns in range(4):
-        turned = _turned(grid, turns)
+        if turns:  # counted from the next of its sides: a quarter turn changes the colours
+            cell = np.stack([turned.cell[:, 1], -turned.cell[:, 0]], axis=-1)
+            turned = CornerGrid(cell, grid.uv_px, not turned.dark)
         bounds = _GridBounds.of(turned, LEAST_IN_LINE)
         if (bounds.size > wanted).any() or (bounds.size < 1).any():
             continue
@@ -57,25 +63,17 @@ def assign_corner_ids(grey: ImageArray, pattern: BoardPattern, grid: CornerGrid)
             reasons.append("some of its corners lie beyond its white margin: something hides it")
             continue
         dark = bool(first.sum() % 2 == 0) == turned.dark
-        orientations.append(_Orientation(position, dark, bounds.size))
+        orientations.append((position, dark, bounds.size))
     if not orientations:
         hidden = f"fewer than {LEAST_IN_LINE} corners of its outer rows and columns can be seen"
         raise BoardRefusedError([*reasons, hidden][0])
-    allowed = [one for one in orientations if one.dark]
-    if not allowed and (orientations[0].size < wanted).any():
+    allowed = [position for position, dark, _ in orientations if dark]
+    if not allowed and (orientations[0][2] < wanted).any():
         # An edge that is taken for the board's own shifts all by a line, which turns the colours.
-        raise BoardRefusedError(ambiguous_place(pattern, orientations[0].size))
-    best = max(allowed or orientations, key=lambda one: _rightward(grid, one.position))
-    return np.asarray(best.position[:, 1] * pattern.columns + best.position[:, 0], np.int64)
-
-
-@dataclass(frozen=True)
-class _Orientation:
-    """One numbering of a grid: `position` [n, 2] (column, row) on the board."""
-
-    position: IntArray
-    dark: bool  #: whether the outer square beyond corner 0 is dark, as it must be
-    size: IntArray  #: columns and rows in sight: with fewer than all, an outer edge placed it
+        raise BoardRefusedError(ambiguous_place(pattern, orientations[0][2]))
+    positions = allowed or [position for position, _, _ in orientations]
+    best = max(positions, key=lambda position: _rightward(grid, position))
+    return np.asarray(best[:, 1] * pattern.columns + best[:, 0], np.int64)
 
 
 @dataclass(frozen=True)
@@ -103,14 +101,6 @@ class _GridBounds:
                 return _GridBounds(low, high)
             cell = cell[~poor]
         return _GridBounds(np.zeros(2, np.int64), np.full(2, -1))
-
-
-def _turned(grid: CornerGrid, turns: int) -> CornerGrid:
-    """The same grid counted from another of its four sides; a quarter turn changes the colours."""
-    cell = grid.cell
-    for _ in range(turns):
-        cell = np.stack([cell[:, 1], -cell[:, 0]], axis=-1)
-    return CornerGrid(cell, grid.uv_px, grid.dark ^ bool(turns % 2))
 
 
 def _first_cell(
@@ -171,13 +161,17 @@ class _BoardEdge:
         outward[axis] = way
         beyond = last + outward
         near = grid.near(beyond)
-        dark, light = _levels(grey, grid, last)
+        # [n] grey levels of dark and light squares about the corners; NaN at the picture's edge.
+        around = quadrants(grey, grid.near(last))
+        pairs = np.stack([around[:, [0, 3]].mean(1), around[:, [1, 2]].mean(1)])
+        dark, light = pairs.min(0)[:, None], pairs.max(0)[:, None]
+        middle, half = (light + dark) / 2, np.maximum(light - dark, 1.0) / 2
         visible, white = np.ones(len(last), np.bool_), np.ones(len(last), np.bool_)
         for share in (_NEAR_STEP, _STEP):
             inner, outer = (_steps(axis, side * way, share) for side in (-1, 1))
-            here, there = (
-                _shade(sample(grey, near.at_steps(step)), dark, light) for step in (inner, outer)
-            )
+            # On a scale from -1 as the dark squares to 1 as the light ones.
+            levels = (sample(grey, near.at_steps(step)) for step in (inner, outer))
+            here, there = ((level - middle) / half for level in levels)
             visible &= (here * grid.lights(beyond, inner) > _CLEARLY).all(1)
             # As light as the board's own squares: the same paper, not a sheet or a glare over it.
             white &= (np.abs(there - 1) < 1 - _CLEARLY).all(1)
@@ -186,25 +180,12 @@ class _BoardEdge:
         return _BoardEdge(*(int((visible & how).sum()) for how in (True, crosses, ends, white)))
 
 
-def _shade(level: FloatArray, dark: FloatArray, light: FloatArray) -> FloatArray:
-    """Grey levels [n, k] on a scale from -1 as the dark squares [n] to 1 as the light ones."""
-    half = np.maximum(light - dark, 1.0)[:, None] / 2
-    return np.asarray((level - (light + dark)[:, None] / 2) / half)
-
-
 def _steps(axis: int, way: int, share: float) -> FloatArray:
     """[2, 2] to the middle of the two squares on one side of a corner, or toward it."""
     step: FloatArray = np.full((2, 2), share)
     step[:, axis] = way * share
     step[0, 1 - axis] = -share
     return step
-
-
-def _levels(grey: ImageArray, grid: CornerGrid, cell: IntArray) -> tuple[FloatArray, FloatArray]:
-    """[n] grey levels of dark and light squares about corners; NaN at the picture's edge."""
-    around = quadrants(grey, grid.near(cell))
-    pairs = np.stack([around[:, [0, 3]].mean(1), around[:, [1, 2]].mean(1)])
-    return np.asarray(pairs.min(0)), np.asarray(pairs.max(0))
 
 
 def _rightward(grid: CornerGrid, position: IntArray) -> float:

@@ -6,22 +6,19 @@ import base64
 import io
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from bikeped.geometry.lens import LIMITS, unit_radius
 from bikeped.lab.calibration.capture.coverage import CircleSector
-from bikeped.lab.calibration.report.field_of_view import FieldOfView
-from bikeped.lab.calibration.solver.initial_guess import FISHEYE
+from bikeped.lab.calibration.report.results import FieldOfView
 from bikeped.lab.calibration.solver.lens_fit import LensFit
 from bikeped.lab.calibration.solver.lens_model import angles, camera_points
 from bikeped.lab.calibration.solver.model_comparison import ModelComparison
+from bikeped.lab.calibration.solver.observations import FISHEYE
 from bikeped.lab.plotting import BLACK, BLUE, GREY, LIGHT, RED, SERIES, FigureSheet
 from bikeped.types import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _BIN_DEG = 10.0
 
@@ -35,6 +32,8 @@ def _png(sheet: FigureSheet) -> str:
 
 def comparison_figure(comparison: ModelComparison, chosen: str) -> str:
     """RMS and cross-validated error of every model, least last."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     fits = comparison.ranked[::-1]
     rows = np.arange(len(fits))
     with FigureSheet(
@@ -45,43 +44,29 @@ def comparison_figure(comparison: ModelComparison, chosen: str) -> str:
         height=0.9 + 0.26 * len(fits),
     ) as sheet:
         axes = sheet.axes[0]
-        for row, f in zip(rows, fits, strict=True):
-            held = f.cross_validated_px
-            if held is not None:
-                axes.plot([f.rms_px, held], [row, row], "-", color=LIGHT, lw=3, zorder=1)
-        axes.plot([f.rms_px for f in fits], rows, "o", color=BLUE, label="fitted (RMS)")
+        fitted = [f.rms_px for f in fits]
         held_out = [np.nan if f.cross_validated_px is None else f.cross_validated_px for f in fits]
+        axes.plot([fitted, held_out], [rows, rows], "-", color=LIGHT, lw=3, zorder=1)
+        axes.plot(fitted, rows, "o", color=BLUE, label="fitted (RMS)")
         axes.plot(held_out, rows, "s", color=RED, label="cross-validated")
         for row, f in zip(rows, fits, strict=True):
             at = max(f.rms_px, f.cross_validated_px or 0.0)
-            axes.annotate(
-                f"{f.ranking_px:.3f}",
-                (at, float(row)),
-                xytext=(7, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-            )
+            where: dict[str, Any] = {"xytext": (7, 0), "textcoords": "offset points"}
+            axes.annotate(f"{f.ranking_px:.3f}", (at, float(row)), **where, va="center", fontsize=8)
         axes.set_yticks(rows, [f.name for f in fits])
         for label in axes.get_yticklabels():
             if label.get_text() == chosen:
                 label.set_fontweight("bold")
         axes.set_xscale("log")
         axes.set_xlabel("error, px")
-        _plain_log(axes)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         low, high = axes.get_xlim()
         axes.set_xlim(low, high * 1.25)
         axes.grid(axis="y", visible=False)
         axes.legend(loc="upper right")
         return _png(sheet)
-
-
-def _plain_log(axes: Axes) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def radial_residuals(fit: LensFit) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -157,10 +142,9 @@ def profile_figure(fit: LensFit, field: FieldOfView) -> str:
         measured = theta <= fit.measured_to_rad
         worst = 0.0
         for projection, (colour, _, dash) in zip(FISHEYE, SERIES, strict=False):
-            inside = theta <= LIMITS[projection]
-            base = np.where(
-                inside, unit_radius(projection, np.minimum(theta, LIMITS[projection])), 0.0
-            )
+            limit = LIMITS[projection]
+            inside = theta <= limit
+            base = np.where(inside, unit_radius(projection, np.minimum(theta, limit)), 0.0)
             both = inside & measured
             focal = float((base[both] @ own[both]) / (base[both] @ base[both]))
             ideal = np.where(inside, focal * base, np.nan)
@@ -200,25 +184,10 @@ def board_figure(fit: LensFit) -> str:
         height=7.0 * (pattern.rows + 0.6) / (pattern.columns + 2.2),
     ) as sheet:
         axes = sheet.axes[0]
-        half = (pattern.columns / 2, pattern.rows / 2)
-        shown = axes.imshow(
-            height,
-            cmap="PuOr",
-            vmin=-bound,
-            vmax=bound,
-            extent=(-half[0], half[0], half[1], -half[1]),
-        )
-        axes.quiver(
-            flat[:, 0],
-            flat[:, 1],
-            shape[:, 0] * 0.4,
-            shape[:, 1] * 0.4,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            width=0.003,
-            color=BLACK,
-        )
+        u, v = pattern.columns / 2, pattern.rows / 2
+        shown = axes.imshow(height, "PuOr", vmin=-bound, vmax=bound, extent=(-u, u, v, -v))
+        scale: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1}
+        axes.quiver(*flat.T[:2], *shape.T[:2] * 0.4, **scale, width=0.003, color=BLACK)
         axes.grid(visible=False)
         axes.set_xticks([])
         axes.set_yticks([])
@@ -241,16 +210,15 @@ def coverage_figure(fit: LensFit, field: FieldOfView, gaps: Sequence[CircleSecto
         subplot_kw={"projection": "polar"},
     ) as sheet:
         axes = sheet.axes[0]
+        look: dict[str, Any] = {"color": "#f6e3c9", "edgecolor": "#d08a2e", "hatch": "///"}
         for gap in gaps:
             axes.bar(
                 (gap.start_rad + gap.stop_rad) / 2,
                 np.degrees(gap.to_rad - gap.from_rad),
                 width=gap.stop_rad - gap.start_rad,
                 bottom=np.degrees(gap.from_rad),
-                color="#f6e3c9",
-                edgecolor="#d08a2e",
-                hatch="///",
                 lw=0.6,
+                **look,
             )
         axes.plot(phi, theta, ".", ms=3, color=BLUE, alpha=0.6, rasterized=True)
         axes.set_theta_direction(-1)  # type: ignore[attr-defined]

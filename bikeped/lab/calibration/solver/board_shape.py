@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.solver.lens_model import CalibrationState, CornerObservations
 from bikeped.lab.calibration.solver.normal_equations import jacobian
 from bikeped.types import FloatArray, IntArray
@@ -55,17 +54,6 @@ def prior_weights(count: int) -> FloatArray:
     return np.tile([PRIOR_IN**-2, PRIOR_IN**-2, PRIOR_OUT**-2], count)
 
 
-def board_symmetries(pattern: BoardPattern) -> IntArray:
-    """[n, C] the numberings of the corners under the board's rotational symmetries.
-
-    Two for a board, four for a square one: row k holds, for each id, which corner of the first
-    numbering gets it. Mirrored numberings are not among them.
-    """
-    ids = np.arange(pattern.count).reshape(pattern.rows, pattern.columns)
-    steps = range(4) if pattern.rows == pattern.columns else (0, 2)
-    return np.stack([np.rot90(ids, step).ravel() for step in steps])
-
-
 def symmetry_rotations(flat: FloatArray, numberings: IntArray) -> FloatArray:
     """[n, 3, 3] rotations of the board for `numberings` [n, C]: flat[numbering[c]] = R flat[c]."""
     out = np.zeros((len(numberings), 3, 3))
@@ -86,11 +74,14 @@ def align_numbering(
     every image the numbering that fits it best; from several starting images, the best is kept.
     """
     pattern, count = observations.pattern, len(observations)
-    numberings = board_symmetries(pattern)
+    # [n, C] numberings under the board's rotational symmetries, two for a board and four for a
+    # square one: for each id, which corner of the first numbering gets it. None is mirrored.
+    ids = np.arange(pattern.count).reshape(pattern.rows, pattern.columns)
+    steps = range(4) if pattern.rows == pattern.columns else (0, 2)
+    numberings = np.stack([np.rot90(ids, step).ravel() for step in steps])
     away = (state.rotation[:, :, 2] * state.translation).sum(-1) < 0
     odd = away if away.mean() <= 0.5 else ~away
-    backwards = numberings[0].reshape(pattern.rows, pattern.columns)[:, ::-1].ravel()
-    handed = np.where(odd[:, None], backwards, numberings[0])
+    handed = np.where(odd[:, None], ids[:, ::-1].ravel(), numberings[0])
     mirrored = state.rotation * np.array([-1.0, 1.0, -1.0])
     state = replace(state, rotation=np.where(odd[:, None, None], mirrored, state.rotation))
     rotations = symmetry_rotations(observations.flat, numberings)

@@ -15,11 +15,10 @@ import numpy as np
 
 from bikeped.errors import CalibrationError
 from bikeped.geometry.lens import Projection, unit_radius
-from bikeped.lab.calibration.solver.initial_guess import FISHEYE
 from bikeped.lab.calibration.solver.lens_fit import LensFit, fit_lens
 from bikeped.lab.calibration.solver.lens_model import CalibrationState, LensModel, corner_angles
 from bikeped.lab.calibration.solver.normal_equations import single_threaded
-from bikeped.lab.calibration.solver.observations import PreparedObservations
+from bikeped.lab.calibration.solver.observations import FISHEYE, PreparedObservations
 
 #: Errors within this share of the best count as equal (the paper's criterion).
 EQUAL_SHARE = 0.02
@@ -127,24 +126,19 @@ def recommend_model(comparison: ModelComparison) -> Recommendation:
     chosen = min(
         equal, key=lambda f: (f.model.terms, FISHEYE.index(f.model.projection), errors[f.name])
     )
-    error = f"{errors[chosen.name]:.3f} px"
-    text = f"{chosen.name} predicts pictures that did not help to fit it to {error}"
-    if chosen is best:
-        simpler = [f for f in known if f.model.terms < chosen.model.terms]
-        if simpler:
-            next_best = min(simpler, key=lambda f: errors[f.name])
-            text += (
-                f", the least of all; with fewer radial terms the best ({next_best.name}) has "
-                f"{errors[next_best.name]:.3f} px"
-            )
-        else:
-            text += ", the least of all"
-    else:
-        text += (
-            f", which is within {EQUAL_SHARE:.0%} of the best ({best.name}, "
+    simpler = [f for f in known if f.model.terms < chosen.model.terms]
+    text = "the least of all"
+    if chosen is not best:
+        text = (
+            f"which is within {EQUAL_SHARE:.0%} of the best ({best.name}, "
             f"{errors[best.name]:.3f} px), and no simpler lens is"
         )
-    return Recommendation(chosen.name, text + ".")
+    elif simpler:
+        name = min(simpler, key=lambda f: errors[f.name]).name
+        text += f"; with fewer radial terms the best ({name}) has {errors[name]:.3f} px"
+    error = f"{errors[chosen.name]:.3f} px"
+    text = f"{chosen.name} predicts pictures that did not help to fit it to {error}, {text}."
+    return Recommendation(chosen.name, text)
 
 
 def paper_criterion(comparison: ModelComparison) -> str:

@@ -71,15 +71,12 @@ def jacobian(state: CalibrationState, flat: FloatArray, *, bent: bool = True) ->
     ux, uy = x / side, y / side
 
     lens = np.zeros((*theta.shape, 2, state.lens.shape[-1]))
-    lens[..., 0, 0] = 1.0
-    lens[..., 1, 1] = 1.0
-    lens[..., 0, 2] = unit * ux
-    lens[..., 1, 2] = unit * uy
+    lens[..., 0, 0] = lens[..., 1, 1] = 1.0
+    lens[..., 0, 2], lens[..., 1, 2] = unit * ux, unit * uy
     power = focal * base
-    for term in range(k.shape[-1]):
+    for column in range(PLAIN, lens.shape[-1]):
         power = power * theta * theta
-        lens[..., 0, PLAIN + term] = power * ux
-        lens[..., 1, PLAIN + term] = power * uy
+        lens[..., 0, column], lens[..., 1, column] = power * ux, power * uy
 
     along = focal * slope * z / square  # d radius / d side
     across = focal * unit / side
@@ -92,14 +89,8 @@ def jacobian(state: CalibrationState, flat: FloatArray, *, bent: bool = True) ->
     to_point[..., 0, 2] = inward * ux
     to_point[..., 1, 2] = inward * uy
 
-    pose = np.empty((*theta.shape, 2, 6))
     # a . (w x q) = w . (q x a), for the turned corner q and each row a.
-    qx, qy, qz = (turned[..., None, axis] for axis in range(3))
-    ax, ay, az = (to_point[..., axis] for axis in range(3))
-    pose[..., 0] = qy * az - qz * ay
-    pose[..., 1] = qz * ax - qx * az
-    pose[..., 2] = qx * ay - qy * ax
-    pose[..., 3:] = to_point
+    pose = np.concatenate([np.cross(turned[..., None, :], to_point), to_point], axis=-1)
     shape = to_point @ state.rotation[:, None] if bent else to_point[..., :0]
     radius = focal * unit
     centre = state.lens[..., :2]
@@ -156,13 +147,10 @@ class NormalEquations:
     def step(self, damping: float) -> AdjustmentStep:
         """The Levenberg-Marquardt step; numpy.linalg.LinAlgError where there is none."""
         pose, shared = self.pose.copy(), self.shared.copy()
-        index = np.arange(6)
-        pose[:, index, index] *= 1 + damping
-        index = np.arange(len(shared))
-        shared[index, index] *= 1 + damping
-        solved = np.linalg.solve(
-            pose, np.concatenate([self.strip, self.pose_slope[..., None]], axis=-1)
-        )
+        np.einsum("vii->vi", pose)[...] *= 1 + damping
+        np.einsum("ii->i", shared)[...] *= 1 + damping
+        right = np.concatenate([self.strip, self.pose_slope[..., None]], axis=-1)
+        solved = np.linalg.solve(pose, right)
         flat_strip = self.strip.reshape(-1, len(shared))
         reduced = shared - flat_strip.T @ solved[..., :-1].reshape(flat_strip.shape)
         slope = self.shared_slope - flat_strip.T @ solved[..., -1].reshape(-1)

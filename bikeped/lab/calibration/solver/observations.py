@@ -1,4 +1,9 @@
-"""From detected boards to a set that can be fitted; CalibrationError where it cannot be.
+"""From detected boards to a set that can be fitted, with a first guess; else CalibrationError.
+
+The guess needs no lens. For every projection and a range of focal lengths the corners become rays;
+a flat board's corners and their rays obey b x (H P) = 0 with H = [r1 r2 t], linear in H, and true
+for rays beside and behind the lens plane as well (a homography between planes would not be). The
+guess whose boards project nearest to the observed corners wins.
 
 Outlier corners are found once, with the most flexible lens, so that every model is judged on the
 same corners.
@@ -12,20 +17,27 @@ from pathlib import Path
 import numpy as np
 
 from bikeped.errors import CalibrationError
-from bikeped.geometry.lens import unit_angle
+from bikeped.geometry.lens import LIMITS, Projection, unit_angle, unit_radius
 from bikeped.lab.calibration.board_view import DetectedBoards, RefusedImage
 from bikeped.lab.calibration.solver.board_shape import align_numbering
-from bikeped.lab.calibration.solver.bundle_adjustment import AdjustmentResult, adjust
-from bikeped.lab.calibration.solver.initial_guess import FISHEYE, first_guess, median_errors_px
+from bikeped.lab.calibration.solver.bundle_adjustment import adjust
 from bikeped.lab.calibration.solver.lens_model import (
     CalibrationState,
     CornerObservations,
     LensModel,
     angles,
+    bearings,
     camera_points,
+    project,
 )
 from bikeped.lab.calibration.solver.normal_equations import single_threaded
+from bikeped.types import FloatArray
 
+FISHEYE: tuple[Projection, ...] = ("equidistant", "equisolid", "stereographic", "orthographic")
+#: Angles that the farthest corner may lie at, degrees from the axis.
+_FARTHEST_DEG: tuple[float, ...] = (20.0, 30.0, 42.0, 55.0, 68.0, 80.0, 90.0, 100.0, 112.0, 125.0)
+_SCANNED = 10  # images that the scan uses: the choice needs no more
+_REWEIGHTED = 4
 FEWEST_BOARDS = 3
 #: Boards are alike when none moves by more than this share of its own size.
 _ALIKE_SHARE = 0.1
@@ -44,6 +56,92 @@ GROSS_SIGMAS, GROSS_PX = 7.0, 1.0
 _BENDS_SHARE = 0.04
 #: An image with fewer inliers, or a smaller share of them, is not used.
 FEWEST_CORNERS, LEAST_SHARE = 8, 0.5
+
+
+@single_threaded
+def first_guess(
+    observations: CornerObservations, projections: tuple[Projection, ...] = FISHEYE
+) -> CalibrationState:
+    """Lens (no radial terms) and poses; CalibrationError where no lens explains the boards.
+
+    The first projection is scanned over all angles, the others near the best of these.
+    """
+    centre = np.array([(observations.width - 1) / 2, (observations.height - 1) / 2])
+    offset = np.where(
+        observations.visible, np.linalg.norm(observations.uv_px - centre, axis=-1), 0.0
+    )
+    farthest = float(offset.max())
+    # The farthest boards tell projections apart; some near ones stabilise the choice.
+    order = np.argsort(offset.max(axis=1))[::-1]
+    some = observations.rows(np.sort(order[:: max(1, len(order) // _SCANNED)][:_SCANNED]))
+    best: tuple[float, Projection, float] | None = None  # mean error, projection, angle
+    chosen = 0.0
+    for projection in projections:
+        around = _FARTHEST_DEG
+        if best is not None:
+            at = _FARTHEST_DEG.index(best[2])
+            around = _FARTHEST_DEG[max(at - 1, 0) : at + 2]
+        for angle in around:
+            if np.radians(angle) > LIMITS[projection] * 0.98:
+                continue
+            focal = farthest / float(unit_radius(projection, np.asarray(np.radians(angle))))
+            state = poses_from_rays(projection, np.array([*centre, focal]), some, reweighted=2)
+            score = float(np.mean(median_errors_px(state, some)))
+            if best is None or score < best[0]:
+                best, chosen = (score, projection, angle), focal
+    if best is None or not np.isfinite(best[0]):
+        raise CalibrationError("no lens makes a board of these corners; check --pattern")
+    return poses_from_rays(best[1], np.array([*centre, chosen]), observations)
+
+
+def median_errors_px(state: CalibrationState, observations: CornerObservations) -> FloatArray:
+    """[V] median distance of each image's corners from their projections, pixels."""
+    error = project(state, camera_points(state, observations.flat)) - observations.uv_px
+    distance = np.hypot(error[..., 0], error[..., 1])
+    return np.asarray(np.nanmedian(np.where(observations.visible, distance, np.nan), axis=1))
+
+
+def poses_from_rays(
+    projection: Projection,
+    lens: FloatArray,
+    observations: CornerObservations,
+    reweighted: int = _REWEIGHTED,
+) -> CalibrationState:
+    """Every board's pose for a lens [cx, cy, f], robust to some wrong corners."""
+    flat = observations.flat
+    half = float(np.abs(flat).max())
+    plane = np.stack([flat[:, 0] / half, flat[:, 1] / half, np.ones(len(flat))], axis=1)
+    rays = bearings(projection, float(lens[2]), lens[:2], observations.uv_px)
+    outer = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # [V, C, 3, 3]
+    moments = plane[:, :, None] * plane[:, None, :]  # [C, 3, 3]
+    weight = observations.visible.astype(np.float64)
+    for _ in range(reweighted):
+        block = (outer.reshape(*outer.shape[:2], 9) * weight[..., None]).transpose(0, 2, 1)
+        square = (block @ moments.reshape(-1, 9)).reshape(-1, 3, 3, 3, 3)
+        matrix = square.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
+        mapped = np.linalg.eigh(matrix)[1][:, :, 0].reshape(-1, 3, 3)
+        ahead = mapped @ plane.T  # [V, 3, C]
+        along = (rays.transpose(0, 2, 1) * ahead).sum(1)
+        sign = np.sign((np.sign(along) * observations.visible).sum(1) + 1e-9)
+        mapped, ahead, along = (
+            x * sign.reshape(-1, *[1] * (x.ndim - 1)) for x in (mapped, ahead, along)
+        )
+        # The angle between ray and corner; the error in pixels is about f times this.
+        sine = np.linalg.norm(np.cross(rays, ahead.transpose(0, 2, 1)), axis=-1)
+        off = np.arctan2(sine, along)
+        size = np.linalg.norm(ahead, axis=1)
+        scale = np.nanmedian(np.where(observations.visible, off, np.nan), axis=1, keepdims=True)
+        weight = observations.visible / (np.maximum(off, scale + 1e-6) * size)
+        weight = weight / np.maximum(size, 1e-12)
+        weight = weight / weight.max(axis=1, keepdims=True)
+    first, second, translation = mapped[..., 0] / half, mapped[..., 1] / half, mapped[..., 2]
+    length = (np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1)) / 2
+    axes = np.stack([first, second, np.cross(first, second) / length[:, None]], axis=-1)
+    left, _, right = np.linalg.svd(axes)
+    rotation = left @ right
+    return CalibrationState(
+        projection, lens, rotation, translation / length[:, None], np.zeros((len(flat), 3))
+    )
 
 
 @dataclass(frozen=True)
@@ -111,7 +209,12 @@ def prepare_observations(boards: DetectedBoards) -> PreparedObservations:
                 f"IMAGES: the corners of {int(useless.sum())} boards contradict one another, and "
                 f"{len(observations)} are left; check --pattern, and that the board is stiff"
             )
-    _check_noise(fitted, observations)
+    square_px = float(np.median(observations.square_px))
+    if fitted.sigma_px > _MOST_NOISE_SHARE * square_px:
+        raise CalibrationError(
+            f"IMAGES: the corners make no {observations.pattern} boards: off by "
+            f"{fitted.sigma_px:.1f} px where a square has {square_px:.0f}; check --pattern"
+        )
     numbering, state = align_numbering(state, observations, fitted.sigma_px)
     observations = observations.renumbered(numbering)
     _check_fisheye(observations, state)
@@ -135,16 +238,6 @@ def _check_count(boards: DetectedBoards) -> None:
             f"IMAGES: {count} of {boards.pattern} inner corners in {pictures}, and a lens needs at "
             f"least {FEWEST_BOARDS}, better 15, all over the picture; photograph more, or correct "
             "--pattern"
-        )
-
-
-def _check_noise(fitted: AdjustmentResult, observations: CornerObservations) -> None:
-    """CalibrationError where the corners are nowhere near a board, even after the best fit."""
-    square = float(np.median(observations.square_px))
-    if fitted.sigma_px > _MOST_NOISE_SHARE * square:
-        raise CalibrationError(
-            f"IMAGES: the corners make no {observations.pattern} boards: off by "
-            f"{fitted.sigma_px:.1f} px where a square has {square:.0f}; check --pattern"
         )
 
 
