@@ -32,7 +32,6 @@ _ROUND_LIMBS_PX = 90.0  #: figures smaller than this need no round limbs
 _USUAL = Conditions()
 #: Share of the light in the middle of the picture below which, at the lens' rim, nothing shows.
 _MIN_VIGNETTE = 0.15
-_Area = tuple[float, float]  #: length and width on the ground
 Box = tuple[float, float, float, float]  #: u1, v1, u2, v2 in pixels of the picture
 
 
@@ -42,7 +41,7 @@ class _SceneItem:
 
     occluder: Occluder
     mesh: Mesh | None = None
-    size_m: _Area = (0.5, 0.5)
+    size_m: tuple[float, float] = (0.5, 0.5)  #: length and width on the ground
 
 
 @dataclass(frozen=True)

@@ -95,9 +95,7 @@ def augment_picture(
     """
     high, wide = image.shape[:2]
     boxes, share = warp_boxes(warp, (wide, high), box_px, polygons)
-    many: BoolArray = np.zeros(len(boxes), np.bool_)
-    if crowd is not None:
-        many |= np.asarray(crowd, np.bool_)
+    many = np.asarray(np.zeros(len(boxes)) if crowd is None else crowd, np.bool_)
     side = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf)
     with np.errstate(invalid="ignore"):
         kept = (side >= least_side_px) & (share >= least_share)
@@ -172,7 +170,7 @@ def _batch(
     jobs: list[tuple[CocoImage, tuple[CocoObject, ...]]], folder: Path, settings: AugmentSettings
 ) -> list[_Made]:
     cv2.setNumThreads(1)  # the processes share the cores already
-    return [_copies(image, objects, folder, settings) for image, objects in jobs]
+    return [_copies(*job, folder, settings) for job in jobs]
 
 
 def _copies(
@@ -251,7 +249,7 @@ def _header(data: CocoData, settings: AugmentSettings) -> dict[str, Any]:
         "seed": settings.seed,
         "copies": settings.copies,
         "least_share": settings.least_share,
-        "ranges": settings.ranges.as_dict(),
+        "ranges": asdict(settings.ranges),
         "area": "of the box: segmentations are not carried along",
     }
     return {**data.header, "info": {**(info if isinstance(info, dict) else {}), "bikeped": record}}

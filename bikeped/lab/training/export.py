@@ -40,8 +40,8 @@ _OPSET = 17
 _MOST_BOX_PX, _MOST_SCORE = 0.05, 1e-3
 CALIBRATION_IMAGES = 64  #: enough to calibrate with
 _INPUT = "images"
-#: Names of the quantised operations, as `export` writes them. The last concatenation is not one:
-#: edges would be rounded to a twentieth of a cell.
+#: Names of the operations to quantise, as `export_network` writes them. The last concatenation is
+#: not one: edges would be rounded to a twentieth of a cell.
 _ROUNDED = re.compile(
     r"/network/(stem/stem\.[12]/|stages\.|lateral\.|merge\.|heads\.\d+/trunk/|Resize|Add)"
 )

@@ -86,10 +86,6 @@ class WarpRanges:
         if not 64 <= self.size_px <= 8192:
             raise GeometryError(f"size: {self.size_px} is not 64 to 8192 pixels")
 
-    def as_dict(self) -> dict[str, Any]:
-        """For the record in augmented data."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
 
 @dataclass(frozen=True)
 class Warp:

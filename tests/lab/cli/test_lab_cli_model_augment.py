@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 from coco_sets import annotation, write_set
@@ -85,7 +86,7 @@ def test_the_help_tells_the_defaults_of_the_code():
 
     ranges = WarpRanges()
     told = {option.name: option for option in command.params}
-    for name, value in ranges.as_dict().items():
+    for name, value in asdict(ranges).items():
         if name == "projections":
             assert told[name].type.choices == list(value) or tuple(told[name].type.choices) == value
         elif name == "size_px":
