@@ -122,7 +122,8 @@ class Suite:
         self, decision: DecisionConfig, localisation_error: bool = True
     ) -> npt.NDArray[np.int8]:
         """State codes of every frame, scenario after scenario."""
-        return states(self._rule_inputs[0 if localisation_error else 1], rule_settings(decision))
+        rows = self.rule_input if localisation_error else self._rule_inputs[1]
+        return states(rows, rule_settings(decision))
 
     def measure(self, decision: DecisionConfig, localisation_error: bool = True) -> Metrics:
         return measure(self.truth_frames, self.states(decision, localisation_error))
