@@ -215,6 +215,22 @@ def test_video_writer_says_why_it_cannot_open(tmp_path, name):
         VideoWriter(tmp_path / name, 30, (320, 180))
 
 
+def test_video_writer_is_closed_once_and_for_all(tmp_path):
+    writer = VideoWriter(tmp_path / "out.mp4", 30, (320, 180))
+    picture = np.zeros((180, 320, 3), np.uint8)
+    writer.write(picture)
+    writer.close()
+    writer.close()
+    with pytest.raises(ValueError, match="closed already"):
+        writer.write(picture)
+
+
+def test_video_writer_refuses_a_size_that_no_encoder_takes(tmp_path):
+    with pytest.raises(CaptureError, match="cannot write MP4"):
+        VideoWriter(tmp_path / "out.mp4", 30, (0, 0))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_video_writer_without_pictures_is_an_error(tmp_path):
     writer = VideoWriter(tmp_path / "out.mp4", 30, (320, 180))
     with pytest.raises(CaptureError, match="no picture"):
