@@ -1,6 +1,4 @@
-"""Overlap of boxes, and greedy non-maximum suppression, exact, over arrays.
-
-Boxes are x1, y1, x2, y2 in the last axis.
+"""Greedy non-maximum suppression, exact, over arrays; and box voting.
 
 The textbook loop keeps the strongest box, drops the weaker ones of its class that overlap it, and
 repeats. Here a block of boxes is processed at a time: within the block the loop's result is the
@@ -15,29 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bikeped.geometry.boxes import iou_matrix
 from bikeped.types import Float32Array, IntArray
 
-Boxes = npt.NDArray[np.floating[Any]]
 _BLOCK = 192
-
-
-def box_area(box: Boxes) -> Boxes:
-    """Areas [...] of boxes [..., 4]; negative sides are not checked for."""
-    return np.asarray((box[..., 2] - box[..., 0]) * (box[..., 3] - box[..., 1]))
-
-
-def intersection_area(a: Boxes, b: Boxes) -> Boxes:
-    """Areas [...] that boxes `a` and `b` ([..., 4] each, broadcast) share; 0 where they touch."""
-    width = np.minimum(a[..., 2], b[..., 2]) - np.maximum(a[..., 0], b[..., 0])
-    height = np.minimum(a[..., 3], b[..., 3]) - np.maximum(a[..., 1], b[..., 1])
-    return np.asarray(np.maximum(width, 0) * np.maximum(height, 0))
-
-
-def iou_matrix(a: Boxes, b: Boxes) -> Boxes:
-    """Intersection over union [n, m] of boxes `a` [n, 4] and `b` [m, 4]; 0 without any area."""
-    shared = intersection_area(a[:, None], b[None])
-    union = box_area(a)[:, None] + box_area(b)[None] - shared
-    return np.asarray(shared / np.maximum(union, np.finfo(np.float32).tiny))
 
 
 def non_max_suppression(

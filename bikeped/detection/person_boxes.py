@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bikeped.detection.nms import box_area, intersection_area
+from bikeped.geometry.boxes import box_area, intersection_area
 from bikeped.types import BoolArray, Detections, Float32Array, Kind
 
 # At least this share of the half lies within the whole; it

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.detection.nms import iou_matrix, non_max_suppression, vote_boxes
+from bikeped.detection.nms import non_max_suppression, vote_boxes
+from bikeped.geometry.boxes import iou_matrix
 
 
 def plain(box, score, group, iou, most):

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from bikeped.config import LoadedConfig
-from bikeped.detection.nms import Boxes, iou_matrix
+from bikeped.geometry.boxes import Boxes, iou_matrix
 from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.simulation.perception import PerceptionResult

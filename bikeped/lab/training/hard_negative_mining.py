@@ -19,7 +19,7 @@ import numpy as np
 
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
-from bikeped.detection.nms import iou_matrix
+from bikeped.geometry.boxes import iou_matrix
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.training.coco import FALSE_POSITIVE, CocoData, CocoImage, furniture
 from bikeped.lab.training.crops import reduced_picture

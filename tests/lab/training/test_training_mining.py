@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 
 from test_training_fit import CROPS, SETTINGS, blobs  # noqa: E402
 
-from bikeped.detection.nms import iou_matrix  # noqa: E402
+from bikeped.geometry.boxes import iou_matrix  # noqa: E402
 from bikeped.lab.training.coco import FALSE_POSITIVE, furniture  # noqa: E402
 from bikeped.lab.training.crops import Cropper, object_centres, read_sample  # noqa: E402
 from bikeped.lab.training.fit import fit, shown_size  # noqa: E402

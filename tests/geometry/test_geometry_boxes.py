@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bikeped.detection.nms import box_area, intersection_area, iou_matrix
+from bikeped.geometry.boxes import box_area, intersection_area, iou_matrix
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
