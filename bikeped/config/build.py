@@ -9,11 +9,11 @@ import math
 
 from bikeped.config.load import Calibration, LoadedConfig
 from bikeped.config.schema import DecisionConfig, TrackingConfig
-from bikeped.decision import RuleSettings
+from bikeped.decision.rules import RuleSettings
 from bikeped.errors import ConfigError, GeometryError
 from bikeped.geometry import Framing, GroundCamera, Lens, canonical_projection
 from bikeped.geometry import road_region as region_of
-from bikeped.tracking import TrackerSettings
+from bikeped.tracking.batch_tracker import TrackerSettings
 from bikeped.types import Region
 
 

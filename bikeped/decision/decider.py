@@ -37,14 +37,9 @@ class Decider:
         if np.count_nonzero(kind == CYCLIST):
             self._last_cyclist_s = time_s
         pedestrians = np.count_nonzero(kind == PEDESTRIAN)
-        code = resolve_state(
-            np.asarray([pedestrians > 0]),
-            is_remembered(
-                np.asarray([time_s]), np.asarray([self._last_cyclist_s]), self.settings.memory_s
-            ),
-            np.asarray([np.count_nonzero(checks.fires) > 0]),
-        )
-        state = State(code.item())
+        remembered = is_remembered(time_s, self._last_cyclist_s, self.settings.memory_s)
+        approaching = np.count_nonzero(checks.fires) > 0
+        state = State(resolve_state(pedestrians > 0, remembered, approaching).item())
         index = select_pair(state, checks.fires, checks.distance_m)
         pair = None if index is None else pair_metrics(index, rows, pairs, checks, self.settings)
         sentence = explain(state, pair, pedestrians, time_s - self._last_cyclist_s, self.settings)
@@ -65,16 +60,19 @@ def pair_metrics(
     index: int, rows: TrackRows, pairs: Pairs, checks: PairChecks, settings: RuleSettings
 ) -> PairMetrics:
     """The measurements of pair `index`."""
+    names = (
+        "distance_m",
+        "distance_then_m",
+        "lookback_s",
+        "displacement_m",
+        "speed_mps",
+        "d_max_m",
+    )
     return PairMetrics(
         cyclist_id=int(rows.id[pairs.cyclist_row[pairs.cyclist[index]]]),
         pedestrian_id=int(rows.id[pairs.pedestrian_row[index]]),
-        distance_m=float(checks.distance_m[index]),
-        distance_then_m=float(checks.distance_then_m[index]),
-        lookback_s=float(checks.lookback_s[index]),
-        displacement_m=float(checks.displacement_m[index]),
-        speed_mps=float(checks.speed_mps[index]),
         d_min_m=settings.d_min_m,
-        d_max_m=float(checks.d_max_m[index]),
+        **{name: float(getattr(checks, name)[index]) for name in names},
     )
 
 

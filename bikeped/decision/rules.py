@@ -103,9 +103,18 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
     c_past, p_past, elapsed = _positions_before(
         rows, cyclist[index], pedestrian[index], settings.lookback_s
     )
-    is_closing, second_check, past_distance, moved = _compare(
-        settings, distance[index], c_now[index], p_now[index], c_past, p_past, elapsed
-    )
+    near, moved = distance[index], _length(c_now[index] - c_past)
+    # The naive rule's flaw: the pedestrian counts as standing.
+    past_distance = _length(c_past - (p_now[index] if settings.rule == "naive" else p_past))
+    is_closing: BoolArray = np.ones(len(index), np.bool_)
+    second_check = is_closing  # rule distance: always
+    if settings.rule == "ttc":
+        closing_mps = (past_distance - near) / np.maximum(elapsed, EPSILON_S)
+        is_closing = closing_mps > TTC_CLOSING_MIN_MPS
+        second_check = near < settings.ttc_s * closing_mps
+    elif settings.rule != "distance":
+        is_closing = near < past_distance - EPSILON_M
+        second_check = moved > settings.min_displacement_m
 
     count = len(pairs)
     distance_then, lookback, displacement = distance.copy(), np.zeros(count), np.zeros(count)
@@ -129,32 +138,6 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
         speed_mps=speed,
         d_max_m=d_max,
     )
-
-
-def _compare(
-    settings: RuleSettings,
-    distance: FloatArray,
-    c_now: FloatArray,
-    p_now: FloatArray,
-    c_past: FloatArray,
-    p_past: FloatArray,
-    elapsed: FloatArray,
-) -> tuple[BoolArray, BoolArray, FloatArray, FloatArray]:
-    """The rule itself, for pairs [k]: `closing`, `displacement_ok` (a pair that passes both fires),
-    the past distance it compared with, and the cyclist's displacement."""
-    past_distance = _length(c_past - p_past)
-    displacement = _length(c_now - c_past)
-    if settings.rule == "distance":
-        always = np.ones(len(distance), np.bool_)
-        return always, always, past_distance, displacement
-    if settings.rule == "ttc":
-        closing_mps = (past_distance - distance) / np.maximum(elapsed, EPSILON_S)
-        soon = distance < settings.ttc_s * closing_mps
-        return closing_mps > TTC_CLOSING_MIN_MPS, soon, past_distance, displacement
-    if settings.rule == "naive":
-        past_distance = _length(c_past - p_now)  # its flaw: the pedestrian counts as standing
-    closing = distance < past_distance - EPSILON_M
-    return closing, displacement > settings.min_displacement_m, past_distance, displacement
 
 
 def _length(vector: FloatArray) -> FloatArray:
@@ -210,21 +193,18 @@ def _walk_back(
 
 
 def resolve_state(
-    pedestrian_present: BoolArray, cyclist_remembered: BoolArray, approaching: BoolArray
+    pedestrian_present: BoolArray | bool,
+    cyclist_remembered: BoolArray | bool,
+    approaching: BoolArray | bool,
 ) -> npt.NDArray[np.int8]:
-    """State codes [n]: IDLE without a pedestrian, SAFE without a remembered cyclist, else ALERT or
-    WARNING by the closing check."""
+    """State codes [n], or one: IDLE without a pedestrian, SAFE without a remembered cyclist, else
+    ALERT or WARNING by the closing check."""
     stage = pedestrian_present * np.int8(4) + cyclist_remembered * np.int8(2) + approaching
     return np.asarray(_STATES[stage])
 
 
-def is_remembered(now_s: FloatArray, last_cyclist_s: FloatArray, memory_s: float) -> BoolArray:
-    """[n]: whether a cyclist was tracked within the last `memory_s`; 0 s means in this frame."""
+def is_remembered(
+    now_s: FloatArray | float, last_cyclist_s: FloatArray | float, memory_s: float
+) -> BoolArray:
+    """[n] or one: was a cyclist tracked within the last `memory_s`? 0 s means in this frame."""
     return np.asarray(now_s - last_cyclist_s <= memory_s + EPSILON_S)
-
-
-def frame_mask(frame: IndexArray, frames: int) -> BoolArray:
-    """[frames]: true at the indices in `frame`."""
-    out = np.zeros(frames, np.bool_)
-    out[frame] = True
-    return out

@@ -52,15 +52,7 @@ class TrackRows:
 
     def view(self, first: int, end: int) -> TrackRows:
         """The rows from `first` to before `end`; the arrays are shared."""
-        at = slice(first, end)
-        return TrackRows(
-            self.frame[at],
-            self.time_s[at],
-            self.id[at],
-            self.kind[at],
-            self.xy_m[at],
-            self.previous[at],
-        )
+        return TrackRows(*(array[first:end] for array in vars(self).values()))
 
 
 @dataclass(frozen=True)

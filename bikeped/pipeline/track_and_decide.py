@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.config import LoadedConfig, framing, ground_camera, rule_settings, tracker_settings
-from bikeped.decision import Decider
+from bikeped.decision.decider import Decider
 from bikeped.geometry import Framing, GroundTable
-from bikeped.tracking import Tracker, predict
+from bikeped.tracking.tracker import Tracker, predict
 from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 
 

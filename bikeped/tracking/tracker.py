@@ -68,9 +68,7 @@ class Tracker:
         velocity = []
         target = time_s - self._speed_window_s + _EPSILON_S
         for key, (x, y) in zip(ids, xy.tolist(), strict=True):
-            path = known.get(key)
-            if path is None:
-                path = deque(maxlen=self._history_length)
+            path = known.get(key) or deque(maxlen=self._history_length)
             past_s, px, py = time_s, x, y
             for past_s, px, py in reversed(path):  # noqa: B007 - used below
                 if past_s <= target:

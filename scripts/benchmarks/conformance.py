@@ -8,13 +8,13 @@ from pathlib import Path
 from benchmarks.figures import Figures, in_turns, seconds
 from bikeped.config import LoadedConfig, load_config, rule_settings
 from bikeped.cores import cores
-from bikeped.decision import Decider
+from bikeped.decision.decider import Decider
 from bikeped.lab.experiments import optimizer
 from bikeped.lab.experiments.reproduce import ReproduceSettings, reproduce
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.simulate import SIMULATION_TRACKER
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare
-from bikeped.tracking import BatchTracker
+from bikeped.tracking.batch_tracker import BatchTracker
 
 
 def run(figures: Figures) -> None:

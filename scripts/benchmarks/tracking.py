@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.figures import Figures, in_turns
 from bikeped.config import load_config, rule_settings, tracker_settings
-from bikeped.decision import Decider
-from bikeped.tracking import Tracker
+from bikeped.decision.decider import Decider
+from bikeped.tracking.tracker import Tracker
 from bikeped.types import GroundPoints
 
 FRAMES = 60

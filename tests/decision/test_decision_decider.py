@@ -8,16 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.decision import (
-    Decider,
-    RuleSettings,
-    TrackRows,
-    evaluate_rule,
-    frame_mask,
-    is_remembered,
-    pair_rows,
-    resolve_state,
-)
+from bikeped.decision.decider import Decider
+from bikeped.decision.rules import RuleSettings, evaluate_rule, is_remembered, resolve_state
+from bikeped.decision.track_rows import TrackRows, pair_rows
 from bikeped.types import State
 
 PEDESTRIAN, CYCLIST = 0, 1
@@ -99,7 +92,6 @@ def test_stages():
                     expected = State.ALERT if near else State.WARNING
                 assert code == expected
     assert is_remembered(np.array([1.0]), np.array([-math.inf]), 100.0).tolist() == [False]
-    assert frame_mask(np.array([0, 2, 2]), 4).tolist() == [True, False, True, False]
 
 
 def test_times_must_increase():
@@ -317,12 +309,12 @@ def states_at_once(rule, frames):
     pairs = pair_rows(rows, count)
     fires = evaluate_rule(rows, pairs, rule).fires
     times = np.array([t for t, _ in frames])
-    cyclist = frame_mask(rows.frame[rows.kind == CYCLIST], count)
+    cyclist = np.bincount(rows.frame[rows.kind == CYCLIST], minlength=count) > 0
     last = np.maximum.accumulate(np.where(cyclist, times, -np.inf))
     return resolve_state(
-        frame_mask(rows.frame[rows.kind == PEDESTRIAN], count),
+        np.bincount(rows.frame[rows.kind == PEDESTRIAN], minlength=count) > 0,
         is_remembered(times, last, rule.memory_s),
-        frame_mask(rows.frame[pairs.pedestrian_row[fires]], count),
+        np.bincount(rows.frame[pairs.pedestrian_row[fires]], minlength=count) > 0,
     ).tolist()
 
 

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.decision import Decider, RuleSettings, TrackRows, evaluate_rule, pair_rows
+from bikeped.decision.decider import Decider
+from bikeped.decision.rules import RuleSettings, evaluate_rule
+from bikeped.decision.track_rows import TrackRows, pair_rows
 from bikeped.types import State
 
 PEDESTRIAN, CYCLIST, VEHICLE = 0, 1, 2

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.tracking import BatchTracker, TrackerSettings
+from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 
 PEDESTRIAN, CYCLIST, VEHICLE = 0, 1, 2
 #: As the pole's configuration has it.

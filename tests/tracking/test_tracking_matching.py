@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.tracking import BatchTracker, TrackerSettings
-from bikeped.tracking.batch_tracker import match_greedy
+from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings, match_greedy
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=150)
 

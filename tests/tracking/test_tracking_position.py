@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bikeped.tracking import BatchTracker, TrackerSettings
+from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 
 RAW = TrackerSettings(velocity_weight=0.2, unbiased=True, max_unseen_s=10.0)
 CALM = replace(RAW, position_weight=0.5)

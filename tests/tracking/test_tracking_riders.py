@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bikeped.tracking import BatchTracker, TrackerSettings
+from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 from bikeped.types import Kind
 
 P, C, V = int(Kind.PEDESTRIAN), int(Kind.CYCLIST), int(Kind.VEHICLE)

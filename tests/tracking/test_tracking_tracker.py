@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bikeped.tracking import Tracker, TrackerSettings, predict
+from bikeped.tracking.batch_tracker import TrackerSettings
+from bikeped.tracking.tracker import Tracker, predict
 from bikeped.types import GroundPoints
 
 

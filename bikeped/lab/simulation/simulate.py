@@ -12,18 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.decision import (
+from bikeped.decision.rules import (
     PairChecks,
-    Pairs,
     RuleSettings,
-    TrackRows,
     evaluate_rule,
-    frame_mask,
     is_remembered,
-    pair_rows,
     resolve_state,
 )
-from bikeped.tracking import BatchTracker, TrackerSettings, predict
+from bikeped.decision.track_rows import Pairs, TrackRows, pair_rows
+from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
+from bikeped.tracking.tracker import predict
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
 
 FPS = 30.0
@@ -184,7 +182,7 @@ def build_rule_input(history: TrackHistory, order: int = 0) -> RuleInput:
         previous=np.where(same, before, -1),
     )
     time_s = np.concatenate([np.arange(n) / FPS for n in history.frames])
-    cyclist = frame_mask(rows.frame[rows.kind == int(Kind.CYCLIST)], total)
+    cyclist = np.bincount(rows.frame[rows.kind == int(Kind.CYCLIST)], minlength=total) > 0
     last = np.where(cyclist, time_s, -np.inf)
     for begin, count in zip(start, history.frames, strict=True):
         part = last[begin : begin + count]
@@ -195,7 +193,7 @@ def build_rule_input(history: TrackHistory, order: int = 0) -> RuleInput:
         start=start,
         frames=history.frames,
         time_s=time_s,
-        pedestrian=frame_mask(rows.frame[rows.kind == int(Kind.PEDESTRIAN)], total),
+        pedestrian=np.bincount(rows.frame[rows.kind == int(Kind.PEDESTRIAN)], minlength=total) > 0,
         cyclist_last_s=last,
     )
 
@@ -210,6 +208,8 @@ def states(
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
     """State codes of every frame, element after element."""
     fired = verdicts(run, settings).fires
-    approaching = frame_mask(run.rows.frame[run.pairs.pedestrian_row[fired]], len(run.time_s))
+    approaching = (
+        np.bincount(run.rows.frame[run.pairs.pedestrian_row[fired]], minlength=len(run.time_s)) > 0
+    )
     memory = is_remembered(run.time_s, run.cyclist_last_s, settings.memory_s)
     return resolve_state(run.pedestrian, memory, approaching)

@@ -13,8 +13,9 @@ import msgspec
 import numpy as np
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.decision import PairChecks, explain, is_remembered, pair_metrics, select_pair
+from bikeped.decision.decider import explain, pair_metrics, select_pair
 from bikeped.decision.episodes import onsets
+from bikeped.decision.rules import PairChecks, is_remembered
 from bikeped.geometry import CameraPose, GroundCamera
 from bikeped.lab.simulation.metrics import finite_or_none, measure
 from bikeped.lab.simulation.simulate import FPS, verdicts

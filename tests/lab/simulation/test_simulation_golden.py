@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from bikeped.config import load_config, rule_settings
-from bikeped.decision import Decider
+from bikeped.decision.decider import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.simulate import FPS, SIMULATION_TRACKER
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
-from bikeped.tracking import Tracker
+from bikeped.tracking.tracker import Tracker
 from bikeped.types import GroundPoints
 
 HERE = Path(__file__).parent

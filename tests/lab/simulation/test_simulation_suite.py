@@ -7,7 +7,7 @@ import pytest
 from detection_losses import misses
 
 from bikeped.config import rule_settings
-from bikeped.decision import Decider
+from bikeped.decision.decider import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.perception import RecallModel, trial_generator
 from bikeped.lab.simulation.simulate import (
@@ -19,7 +19,7 @@ from bikeped.lab.simulation.simulate import (
     track,
 )
 from bikeped.lab.simulation.suite import CONFIGURATIONS
-from bikeped.tracking import Tracker, predict
+from bikeped.tracking.tracker import Tracker, predict
 from bikeped.types import GroundPoints, State
 
 NAMES = [s.name for s in load_scenarios(bundled_folder())]

@@ -10,7 +10,7 @@ from aiohttp.test_utils import TestClient, TestServer
 from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 
 from bikeped.config import DecisionConfig, rule_settings
-from bikeped.decision import Decider
+from bikeped.decision.decider import Decider
 from bikeped.lab.experiments.latency import sweep
 from bikeped.lab.experiments.trials import (
     LossModel,
