@@ -87,29 +87,27 @@ class Mark:
 
     def __post_init__(self) -> None:
         given = (self.distance_m, self.forward_m, self.right_m)
-        if not all(math.isfinite(x) for x in (self.u_px, self.v_px, *given) if x is not None):
-            raise GeometryError(f"mark {self.name}: a number is not finite; measure it again")
-        if self.distance_m is None and self.forward_m is None:
-            raise GeometryError(
-                f"mark {self.name}: distance_m: missing; measure from the foot of the pole to it"
-            )
-        if None not in given:
-            raise GeometryError(
-                f"mark {self.name}: distance_m, forward_m and right_m over-determine it; leave "
-                "out distance_m or forward_m"
-            )
-        if self.distance_m is None:
-            return
-        if self.distance_m <= 0:
-            raise GeometryError(
-                f"mark {self.name}: distance_m: {self.distance_m:g} must be above 0"
-            )
         across = max(abs(self.forward_m or 0.0), abs(self.right_m or 0.0))
-        if across > self.distance_m:
-            raise GeometryError(
-                f"mark {self.name}: {across:g} m to the side or ahead is more than its distance "
-                f"of {self.distance_m:g} m; measure both again"
+        problem = None
+        if not all(math.isfinite(x) for x in (self.u_px, self.v_px, *given) if x is not None):
+            problem = "a number is not finite; measure it again"
+        elif self.distance_m is None:
+            if self.forward_m is None:
+                problem = "distance_m: missing; measure from the foot of the pole to it"
+        elif None not in given:
+            problem = (
+                "distance_m, forward_m and right_m over-determine it; leave out distance_m or "
+                "forward_m"
             )
+        elif self.distance_m <= 0:
+            problem = f"distance_m: {self.distance_m:g} must be above 0"
+        elif across > self.distance_m:
+            problem = (
+                f"{across:g} m to the side or ahead is more than its distance of "
+                f"{self.distance_m:g} m; measure both again"
+            )
+        if problem:
+            raise GeometryError(f"mark {self.name}: {problem}")
 
 
 @dataclass(frozen=True)

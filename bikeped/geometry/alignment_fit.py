@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -25,7 +26,6 @@ from bikeped.geometry.alignment import (
     MeasurementAccuracy,
     Residual,
     Spacing,
-    ground_distance_m,
     pixel_at_distance,
 )
 from bikeped.geometry.camera import GroundCamera
@@ -53,10 +53,10 @@ def fit_alignment(
             f"free: {', '.join(unknown) or 'nothing, or a name twice'}; use some of "
             f"{', '.join(PARAMETER_NAMES)}"
         )
-    problem = _Problem(camera, marks, spacings, tuple(free), accuracy or MeasurementAccuracy())
+    problem = _Problem(camera, marks, spacings, free, accuracy or MeasurementAccuracy())
     problem.check()
     solutions = [problem.minimise(start) for start in problem.starts()]
-    found = sorted(((*problem.costs(x), x) for x in solutions), key=lambda answer: answer[0])
+    found = sorted(((*problem.costs(x), x) for x in solutions), key=itemgetter(0))
     if not found:
         raise GeometryError(
             "no pitch puts every mark on the ground: is each on flat ground, below the horizon, "
@@ -65,7 +65,7 @@ def fit_alignment(
     _, cost, best = found[0]
     covariance = problem.covariance(best, cost)
     error = dict(zip(free, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    problem.check_unique([(score, x) for score, _, x in found], error)
+    problem.check_unique(found, error)
     answer = AlignmentFit(
         alignment=best,
         standard_errors=error,
@@ -73,22 +73,19 @@ def fit_alignment(
         redundancy=problem.count - len(free),
         standard_error_at_10m_m=problem.standard_error_at_10m(best, covariance),
     )
-    if not answer.outliers:
-        return answer
-    return replace(answer, suspect_mark=_suspect_mark(problem, spacings, cost))
+    return replace(answer, suspect_mark=_suspect_mark(problem, cost)) if answer.outliers else answer
 
 
-def _suspect_mark(problem: _Problem, spacings: Sequence[Spacing], cost: float) -> str | None:
+def _suspect_mark(problem: _Problem, cost: float) -> str | None:
     """The mark without which the others agree; least squares spreads its error over all marks."""
     marks, candidates = problem.marks, []
     for i, mark in enumerate(marks):
         kept = [
             Spacing(s.first - (s.first > i), s.second - (s.second > i), s.distance_m)
-            for s in spacings
+            for s in problem.spacings
             if i not in (s.first, s.second)
         ]
-        rest = [*marks[:i], *marks[i + 1 :]]
-        fewer = _Problem(problem.like, rest, kept, problem.free, problem.accuracy)
+        fewer = replace(problem, marks=[*marks[:i], *marks[i + 1 :]], spacings=kept)
         if fewer.count > len(problem.free):
             squares = (fewer.costs(fewer.minimise(start))[1] for start in fewer.starts())
             candidates.append((min(squares, default=math.inf), mark.name))
@@ -96,18 +93,18 @@ def _suspect_mark(problem: _Problem, spacings: Sequence[Spacing], cost: float) -
     return best[1] if best[0] < 0.2 * cost else None
 
 
+@dataclass
 class _Problem:
     """The weighted least-squares problem of the marks and spacings."""
 
-    def __init__(
-        self,
-        camera: GroundCamera,
-        marks: Sequence[Mark],
-        spacings: Sequence[Spacing],
-        free: tuple[str, ...],
-        accuracy: MeasurementAccuracy,
-    ) -> None:
-        self.like, self.marks, self.free, self.accuracy = camera, marks, free, accuracy
+    like: GroundCamera
+    marks: Sequence[Mark]
+    spacings: Sequence[Spacing]
+    free: Sequence[str]
+    accuracy: MeasurementAccuracy
+
+    def __post_init__(self) -> None:
+        marks = self.marks
         self.uv_px = np.array([[m.u_px, m.v_px] for m in marks], np.float64).reshape(-1, 2)
         rows: list[tuple[str, str, int, int, float]] = []  # mark, quantity, indices, metres
         for i, mark in enumerate(marks):
@@ -115,7 +112,7 @@ class _Problem:
                 value = getattr(mark, f"{quantity}_m")
                 if value is not None:
                     rows.append((mark.name, quantity, i, i, float(value)))
-        for spacing in spacings:
+        for spacing in self.spacings:
             i, j = spacing.first, spacing.second
             if not (0 <= i < len(marks) and 0 <= j < len(marks)) or i == j:
                 raise GeometryError("spacings: name two different marks that are there")
@@ -132,10 +129,10 @@ class _Problem:
         """Raises GeometryError for marks that no fit can use."""
         if self.count < len(self.free):
             names = _names(self.free)
+            missing = len(self.free) - self.count
             raise GeometryError(
                 f"{self.count} measurement{'s' * (self.count != 1)} cannot determine "
-                f"{len(self.free)} parameters ({names}): add "
-                f"{len(self.free) - self.count} more, better two or three"
+                f"{len(self.free)} parameters ({names}): add {missing} more, better two or three"
             )
         for i, mark in enumerate(self.marks):
             for other in self.marks[:i]:
@@ -143,7 +140,7 @@ class _Problem:
                     raise GeometryError(
                         f"marks {other.name} and {mark.name} are the same pixel; move or delete one"
                     )
-        if "radius_px" not in self.free and "cx" not in self.free and "cy" not in self.free:
+        if not {"radius_px", "cx", "cy"} & set(self.free):
             dark = np.isnan(self.like.rays(self.uv_px)).any(axis=1)
             if dark.any():
                 raise GeometryError(
@@ -151,23 +148,20 @@ class _Problem:
                     "move it, or correct radius and centre first"
                 )
 
-    def predict(self, alignment: Alignment) -> tuple[FloatArray, FloatArray] | None:
+    def predict(self, alignment: Alignment) -> tuple[FloatArray, FloatArray]:
         """The camera's reading of each measurement [m], and its derivative by mark pixels [m, 2n].
 
-        None when a mark is not on the ground, or the parameters give no camera.
+        All NaN when a mark is not on the ground, or the parameters give no camera.
         """
-        try:
-            camera = alignment.camera(self.like)
-        except GeometryError:
-            return None
         step = 0.25
         around = step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        xy, valid = camera.ground(self.uv_px[:, None, :] + around)
+        value, slope = np.empty(self.count), np.zeros((self.count, 2 * len(self.marks)))
+        try:
+            xy, valid = alignment.camera(self.like).ground(self.uv_px[:, None, :] + around)
+        except GeometryError:
+            valid = np.zeros(1, np.bool_)
         if not valid.all():
-            return None
-        n = len(self.marks)
-        value = np.empty(self.count)
-        slope = np.zeros((self.count, 2 * n))
+            return np.full_like(value, np.nan), np.full_like(slope, np.nan)
         for row, (_, quantity, i, j, _) in enumerate(self.rows):
             for k, other in ((i, j), (j, i)) if quantity == "spacing" else ((i, i),):
                 reads = _measure(quantity, xy[k], xy[other, 0])
@@ -187,27 +181,23 @@ class _Problem:
         Positions are proportional to the height, which gives each pitch its height directly.
         """
         own = Alignment.of(self.like)
-        grid = [own]
         pitches = range(-85, 45, 5) if "pitch_deg" in self.free else [own.pitch_deg]
         headings = range(-180, 180, 45) if "heading_deg" in self.free else [0]
-        grid += [
+        grid = [
             replace(own, pitch_deg=float(pitch), heading_deg=own.heading_deg + offset)
             for pitch in pitches
             for offset in headings
         ]
         found = []
-        for start in grid:
-            answer = self.predict(start)
-            if answer is None:
-                continue
+        for start in (own, *grid):
             if "height_m" in self.free:
-                size = float(answer[0] @ answer[0])
-                share = float(answer[0] @ self.measured_m) / size if size > 0 else 1.0
-                height_m = start.height_m * share
-                if 0.1 < height_m <= 100:
-                    start = replace(start, height_m=height_m)
+                value, _ = self.predict(start)
+                size = float(value @ value)
+                share = float(value @ self.measured_m) / size if size > 0 else 1.0
+                if 0.1 < start.height_m * share <= 100:
+                    start = replace(start, height_m=start.height_m * share)
             found.append((self.costs(start)[0], start))
-        found.sort(key=lambda answer: answer[0])
+        found.sort(key=itemgetter(0))
         return [start for score, start in found[:4] if math.isfinite(score)]
 
     def costs(self, alignment: Alignment) -> tuple[float, float]:
@@ -216,10 +206,10 @@ class _Problem:
         Solutions are compared by the likelihood: near the horizon nothing is precise, and every
         sum of squares is small. Infinite where there is no reading.
         """
-        answer = self.predict(alignment)
-        if answer is None:
+        value, slope = self.predict(alignment)
+        if np.isnan(value).any():
             return math.inf, math.inf
-        residual, covariance = answer[0] - self.measured_m, self.residual_covariance(answer[1])
+        residual, covariance = value - self.measured_m, self.residual_covariance(slope)
         squares = float(residual @ np.linalg.solve(covariance, residual))
         return squares + float(np.linalg.slogdet(covariance)[1]), squares
 
@@ -231,25 +221,18 @@ class _Problem:
         """
         here, damping = start, 1e-3
         for _ in range(_MAX_ITERATIONS):
-            answer = self.predict(here)
-            if answer is None:
+            weight, value, jacobian = self.linearised(here)
+            if np.isnan(jacobian).any():
                 break
-            weight = np.linalg.inv(np.linalg.cholesky(self.residual_covariance(answer[1])))
-            residual = weight @ (answer[0] - self.measured_m)
-            jacobian = self.jacobian(here)
-            if jacobian is None:
-                break
-            jacobian = weight @ jacobian
+            residual = weight @ (value - self.measured_m)
             normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
             while damping < 1e9:
                 damped = normal + damping * np.diag(np.diag(normal) + 1e-12)
                 step = -np.linalg.solve(damped, gradient)
                 there = self.stepped(here, np.clip(step, -10, 10))
-                tried = self.predict(there)
-                if tried is not None:
-                    new_residual = weight @ (tried[0] - self.measured_m)
-                    if new_residual @ new_residual <= residual @ residual:
-                        break
+                new_residual = weight @ (self.predict(there)[0] - self.measured_m)
+                if new_residual @ new_residual <= residual @ residual:  # not where it is NaN
+                    break
                 damping *= 4
             else:
                 break
@@ -267,20 +250,21 @@ class _Problem:
         }
         return replace(alignment, **to)
 
-    def jacobian(self, alignment: Alignment) -> FloatArray | None:
-        """Derivative [m, p] of the readings by the scaled free parameters."""
-        return self._derivatives(alignment, lambda a: (self.predict(a) or (None,))[0], 1e-4)
+    def linearised(self, at: Alignment) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The weights [m, m] of the residuals, the readings [m], and the weighted derivative [m, p]
+        of the readings by the scaled free parameters (NaN at the edge of the possible range)."""
+        value, slope = self.predict(at)
+        weight = np.linalg.inv(np.linalg.cholesky(self.residual_covariance(slope)))
+        return weight, value, weight @ self._derivatives(at, lambda a: self.predict(a)[0], 1e-4)
 
     def _derivatives(
-        self, at: Alignment, value: Callable[[Alignment], FloatArray | None], step: float
-    ) -> FloatArray | None:
+        self, at: Alignment, value: Callable[[Alignment], FloatArray], step: float
+    ) -> FloatArray:
         """Central differences [k, p] of `value` [k] by the scaled free parameters."""
-        columns = []
-        for steps in step * np.eye(len(self.free)):
-            up, down = value(self.stepped(at, steps)), value(self.stepped(at, -steps))
-            if up is None or down is None:
-                return None
-            columns.append((up - down) / (2 * step))
+        columns = [
+            (value(self.stepped(at, steps)) - value(self.stepped(at, -steps))) / (2 * step)
+            for steps in step * np.eye(len(self.free))
+        ]
         return np.stack(columns, axis=1)
 
     def covariance(self, best: Alignment, cost: float) -> FloatArray:
@@ -288,14 +272,13 @@ class _Problem:
 
         Scaled up where redundant measurements disagree by more than tape and pixel explain.
         """
-        answer, jacobian = self.predict(best), self.jacobian(best)
-        if answer is None or jacobian is None:
+        _, _, jacobian = self.linearised(best)
+        if np.isnan(jacobian).any():
             raise GeometryError(
                 "the best fit lies at the edge of the possible range: check the marks "
                 "and their distances"
             )
-        weight = np.linalg.inv(np.linalg.cholesky(self.residual_covariance(answer[1])))
-        _, size, axes = np.linalg.svd(weight @ jacobian, full_matrices=False)
+        _, size, axes = np.linalg.svd(jacobian, full_matrices=False)
         limits = np.array([_LIMIT[name] for name in self.free])
         inverse = 1 / np.maximum(size, 1e-9)
         error = np.sqrt(((axes.T * inverse) ** 2).sum(axis=1))  # in scales
@@ -331,11 +314,11 @@ class _Problem:
         )
 
     def check_unique(
-        self, found: Sequence[tuple[float, Alignment]], error: dict[str, float]
+        self, found: Sequence[tuple[float, float, Alignment]], error: dict[str, float]
     ) -> None:
         """Raises GeometryError when a different solution fits nearly as well as the best."""
-        score, best = found[0]
-        for other_score, other in found[1:]:
+        score, _, best = found[0]
+        for other_score, _, other in found[1:]:
             apart = any(
                 abs(getattr(other, name) - getattr(best, name))
                 > max(6 * error[name], 0.3 * best.scale(name))
@@ -347,14 +330,12 @@ class _Problem:
 
     def residuals(self, best: Alignment) -> tuple[Residual, ...]:
         """Each measurement beside the camera's reading."""
-        answer = self.predict(best)
-        if answer is None:  # checked by `covariance`
-            return ()
-        expected = np.sqrt(np.diag(self.residual_covariance(answer[1])))
+        value, slope = self.predict(best)
+        expected = np.sqrt(np.diag(self.residual_covariance(slope)))
         return tuple(
             Residual(name, quantity, measured, float(read), float(sigma))
             for (name, quantity, _, _, measured), read, sigma in zip(
-                self.rows, answer[0], expected, strict=True
+                self.rows, value, expected, strict=True
             )
         )
 
@@ -364,15 +345,13 @@ class _Problem:
         if pixel is None:
             return None
 
-        def reading(alignment: Alignment) -> FloatArray | None:
-            distance_m = ground_distance_m(alignment.camera(self.like), pixel)
-            return None if distance_m is None else np.array([distance_m])
+        def reading(alignment: Alignment) -> FloatArray:
+            return np.asarray(np.hypot(*alignment.camera(self.like).ground([pixel])[0].T))
 
-        slope = self._derivatives(best, reading, 1e-3)
-        if slope is None:
-            return None
-        slope = slope[0] / np.array([best.scale(name) for name in self.free])
-        return float(np.sqrt(slope @ covariance @ slope))
+        slope = self._derivatives(best, reading, 1e-3)[0]
+        slope = slope / np.array([best.scale(name) for name in self.free])
+        error_m = float(np.sqrt(slope @ covariance @ slope))
+        return None if math.isnan(error_m) else error_m
 
 
 def _measure(quantity: str, xy_m: FloatArray, other_m: FloatArray) -> FloatArray:

@@ -116,8 +116,7 @@ class CameraPose:
 
     def world_to_ground(self, xy_m: npt.ArrayLike) -> FloatArray:
         """World positions [..., 2] in the camera ground frame (x forward, y right)."""
-        delta = np.asarray(xy_m, dtype=np.float64) - np.array([self.x_m, self.y_m])
-        return np.asarray(delta @ self._axes().T)
+        return self.turn_to_ground(np.asarray(xy_m, np.float64) - (self.x_m, self.y_m))
 
     def turn_to_ground(self, direction: npt.ArrayLike) -> FloatArray:
         """World directions [..., 2] in the camera ground frame."""
@@ -125,8 +124,7 @@ class CameraPose:
 
     def ground_to_world(self, xy_m: npt.ArrayLike) -> FloatArray:
         """Camera ground positions [..., 2] in the world."""
-        turned: FloatArray = np.asarray(xy_m, dtype=np.float64) @ self._axes()
-        return np.asarray(turned + np.array([self.x_m, self.y_m]))
+        return np.asarray(np.asarray(xy_m, np.float64) @ self._axes() + (self.x_m, self.y_m))
 
     def _axes(self) -> FloatArray:
         c, s = math.cos(math.radians(self.heading_deg)), math.sin(math.radians(self.heading_deg))
@@ -150,12 +148,13 @@ class GroundTable:
         self._rays: Float32Array = np.empty((rows, columns, 3), np.float32)
         for first in range(0, rows, _ROWS_AT_ONCE):
             last = min(first + _ROWS_AT_ONCE, rows)
-            self._rays[first:last] = camera.rays(_grid(u, v[first:last]))
+            self._rays[first:last] = camera.rays(np.stack(np.meshgrid(u, v[first:last]), axis=-1))
         self._exact: BoolArray = np.ones((rows - 1, columns - 1), np.bool_)
         half = step_px / 2
         for first in range(0, rows - 1, _ROWS_AT_ONCE):
             last = min(first + _ROWS_AT_ONCE, rows - 1)
-            truth = camera.rays(_grid(u[:-1] + half, v[first:last] + half))
+            middle = np.meshgrid(u[:-1] + half, v[first:last] + half)
+            truth = camera.rays(np.stack(middle, axis=-1))
             block = self._rays[first : last + 1]
             mean = (block[:-1, :-1] + block[:-1, 1:] + block[1:, :-1] + block[1:, 1:]) / 4
             self._exact[first:last] = ~_close(mean, truth, camera.height_m)
@@ -190,14 +189,6 @@ class GroundTable:
         if exact.any():
             xy[exact], down[exact] = self.camera.ground(uv[exact])
         return xy, down
-
-
-def _grid(u: FloatArray, v: FloatArray) -> FloatArray:
-    """[len(v), len(u), 2] pixels."""
-    grid = np.empty((len(v), len(u), 2))
-    grid[..., 0] = u
-    grid[..., 1] = v[:, None]
-    return grid
 
 
 def _close(ray: npt.NDArray[np.floating], truth: FloatArray, height_m: float) -> BoolArray:

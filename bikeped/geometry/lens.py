@@ -24,40 +24,34 @@ from bikeped.types import FloatArray
 Projection = Literal["equidistant", "equisolid", "stereographic", "orthographic", "perspective"]
 
 _ALIASES = {"linear": "equidistant", "equalarea": "equisolid"}
-#: The angle from the axis at which each projection ends, radians.
-LIMITS: dict[str, float] = {
-    "equidistant": math.pi,
-    "equisolid": math.pi,
-    # Less than 180 degrees, where r is infinite.
-    "stereographic": math.radians(179.0),
-    "orthographic": math.pi / 2,
-    "perspective": math.radians(89.5),
-}
 _SAMPLES = 2048
 
 
-class _Functions(NamedTuple):
-    """g(theta) for f = 1 without radial terms, its derivative, and its inverse."""
+class _Formula(NamedTuple):
+    """A projection for f = 1 without radial terms, angles in radians."""
 
-    radius: Callable[[FloatArray], FloatArray]
-    slope: Callable[[FloatArray], FloatArray]
-    angle: Callable[[FloatArray], FloatArray]
+    limit_rad: float  #: the angle from the axis at which it ends
+    radius: Callable[[FloatArray], FloatArray]  #: g(theta), the image radius
+    slope: Callable[[FloatArray], FloatArray]  #: dg/dtheta
+    theta: Callable[[FloatArray], FloatArray]  #: of a radius; beyond the range, its limit
 
 
-_FUNCTIONS = {
-    "equidistant": _Functions(lambda t: t, np.ones_like, lambda r: r),
-    "equisolid": _Functions(
+PROJECTIONS: dict[str, _Formula] = {
+    "equidistant": _Formula(math.pi, lambda t: t, np.ones_like, lambda r: r),
+    "equisolid": _Formula(
+        math.pi,
         lambda t: 2 * np.sin(t / 2),
         lambda t: np.cos(t / 2),
         lambda r: 2 * np.arcsin(np.minimum(r / 2, 1.0)),
     ),
-    "stereographic": _Functions(
+    "stereographic": _Formula(
+        math.radians(179.0),  # less than 180 degrees, where r is infinite
         lambda t: 2 * np.tan(t / 2),
         lambda t: 1 / np.cos(t / 2) ** 2,
         lambda r: 2 * np.arctan(r / 2),
     ),
-    "orthographic": _Functions(np.sin, np.cos, lambda r: np.arcsin(np.minimum(r, 1.0))),
-    "perspective": _Functions(np.tan, lambda t: 1 / np.cos(t) ** 2, np.arctan),
+    "orthographic": _Formula(math.pi / 2, np.sin, np.cos, lambda r: np.arcsin(np.minimum(r, 1.0))),
+    "perspective": _Formula(math.radians(89.5), np.tan, lambda t: 1 / np.cos(t) ** 2, np.arctan),
 }
 
 
@@ -67,26 +61,11 @@ def canonical_projection(name: str) -> Projection:
     Raises GeometryError for an unknown name.
     """
     proper = _ALIASES.get(name, name)
-    if proper not in LIMITS:
+    if proper not in PROJECTIONS:
         raise GeometryError(
-            f"projection: unknown model {name!r}; use one of {', '.join(sorted(LIMITS))}"
+            f"projection: unknown model {name!r}; use one of {', '.join(sorted(PROJECTIONS))}"
         )
     return cast(Projection, proper)
-
-
-def unit_radius(projection: str, theta: FloatArray) -> FloatArray:
-    """g(theta): image radius at angle `theta` (rad) for f = 1 without radial terms."""
-    return np.asarray(_FUNCTIONS[projection].radius(theta))
-
-
-def unit_radius_slope(projection: str, theta: FloatArray) -> FloatArray:
-    """dg/dtheta."""
-    return np.asarray(_FUNCTIONS[projection].slope(theta))
-
-
-def unit_angle(projection: str, radius: FloatArray) -> FloatArray:
-    """theta (rad) for f = 1 without radial terms; beyond the projection's range, its limit."""
-    return np.asarray(_FUNCTIONS[projection].angle(radius))
 
 
 @dataclass(frozen=True)
@@ -111,7 +90,7 @@ class Lens:
                 f"focal length: {self.focal_px} px is not a positive number; check radius_px, "
                 "fov_deg and the calibration's focal_length"
             )
-        limit = LIMITS[self.projection]
+        limit = PROJECTIONS[self.projection].limit_rad
         if not 0 < self.max_theta_rad <= limit + 1e-9:
             raise GeometryError(
                 f"fov_deg: {math.degrees(2 * self.max_theta_rad):.1f} is outside what a "
@@ -141,9 +120,8 @@ class Lens:
         """
         proper = canonical_projection(projection)
         half = math.radians(fov_deg) / 2
-        unit = float(
-            unit_radius(proper, np.asarray([min(half, LIMITS[proper])], dtype=np.float64))[0]
-        )
+        formula = PROJECTIONS[proper]
+        unit = float(formula.radius(np.asarray(min(half, formula.limit_rad))))
         if unit <= 0:
             raise GeometryError(f"fov_deg: {fov_deg} gives no focal length; use a positive angle")
         return Lens(proper, radius_px / unit, half, k)
@@ -156,7 +134,7 @@ class Lens:
     def radius(self, theta: npt.ArrayLike) -> FloatArray:
         """Image radius in pixels at angles `theta` (radians, any shape)."""
         angle = np.asarray(theta, dtype=np.float64)
-        base = unit_radius(self.projection, angle)
+        base = PROJECTIONS[self.projection].radius(angle)
         if any(self.k):
             base = base * self._gain(angle)
         return self.focal_px * base
@@ -168,15 +146,15 @@ class Lens:
         """
         radius = np.asarray(radius_px, dtype=np.float64)
         inside = radius <= self.max_radius_px * (1 + 1e-12)
-        unit = radius / self.focal_px
+        unit, formula = radius / self.focal_px, PROJECTIONS[self.projection]
         if not any(self.k):
-            angle = unit_angle(self.projection, unit)
+            angle = formula.theta(unit)
         else:
             angle = np.interp(radius, self._radius_table, self._theta_table)
             for _ in range(4):  # quadratic from 1e-3 at worst: four steps reach the last bit
                 gain, gain_slope = self._gain(angle), self._gain_slope(angle)
-                base = unit_radius(self.projection, angle)
-                slope = unit_radius_slope(self.projection, angle) * gain + base * gain_slope
+                base = formula.radius(angle)
+                slope = formula.slope(angle) * gain + base * gain_slope
                 with np.errstate(divide="ignore", invalid="ignore"):
                     step = np.where(slope > 1e-9, (base * gain - unit) / slope, 0.0)
                 angle = np.clip(angle - step, 0, self.max_theta_rad)

@@ -10,7 +10,7 @@ import pytest
 from calibration_scenes import boards, camera, found
 from synthetic_boards import BoardBend
 
-from bikeped.geometry.lens import Projection, unit_radius
+from bikeped.geometry.lens import PROJECTIONS, Projection
 from bikeped.lab.calibration.capture.coverage import Coverage
 from bikeped.lab.calibration.report.results import CalibrationResult, field_of_view, result_data
 from bikeped.lab.calibration.solver.lens_fit import LensFit
@@ -115,7 +115,7 @@ def test_a_start_for_another_model_keeps_the_radii(bent: ModelComparison) -> Non
     theta = corner_angles(prepared.start, prepared.observations)[prepared.observations.visible]
     other = initial_state(LensModel("equidistant", 4), prepared)
     fitted = bent.fits["equisolid+k4"]
-    own = other.lens[2] * unit_radius("equidistant", theta)
+    own = other.lens[2] * PROJECTIONS["equidistant"].radius(theta)
     k = other.terms
     own = own * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
     assert np.abs(own - fitted.state.radius_px(theta)).max() < 3.0  # of 500 px

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.geometry.lens import LIMITS, unit_radius
+from bikeped.geometry.lens import PROJECTIONS
 from bikeped.lab.calibration.capture.coverage import CircleSector
 from bikeped.lab.calibration.report.results import FieldOfView
 from bikeped.lab.calibration.solver.lens_fit import LensFit
@@ -142,9 +142,9 @@ def profile_figure(fit: LensFit, field: FieldOfView) -> str:
         measured = theta <= fit.measured_to_rad
         worst = 0.0
         for projection, (colour, _, dash) in zip(FISHEYE, SERIES, strict=False):
-            limit = LIMITS[projection]
+            limit = PROJECTIONS[projection].limit_rad
             inside = theta <= limit
-            base = np.where(inside, unit_radius(projection, np.minimum(theta, limit)), 0.0)
+            base = np.where(inside, PROJECTIONS[projection].radius(np.minimum(theta, limit)), 0.0)
             both = inside & measured
             focal = float((base[both] @ own[both]) / (base[both] @ base[both]))
             ideal = np.where(inside, focal * base, np.nan)

@@ -16,7 +16,7 @@ from bikeped import __version__
 from bikeped.errors import CalibrationError, GeometryError
 from bikeped.files import write_whole
 from bikeped.geometry import Framing
-from bikeped.geometry.lens import LIMITS, unit_radius
+from bikeped.geometry.lens import PROJECTIONS
 from bikeped.lab.calibration.capture.coverage import Coverage
 from bikeped.lab.calibration.solver.lens_fit import LensFit, rms_by_image
 from bikeped.lab.calibration.solver.model_comparison import ModelComparison, Recommendation
@@ -77,7 +77,7 @@ def field_of_view(
     radius, ends_at = far, "the corner of the picture"
     if circle_px is not None and circle_px < far:
         radius, ends_at = circle_px, "the image circle"
-    limit = LIMITS[fit.model.projection]
+    limit = PROJECTIONS[fit.model.projection].limit_rad
     theta: FloatArray = np.linspace(0.0, limit, _SAMPLES, dtype=np.float64)
     grown = fit.state.radius_px(theta)
     slow = np.diff(grown, append=np.inf) < _LEAST_SLOPE * fit.focal_px * theta[1]
@@ -142,7 +142,7 @@ def calibration_data(
             f"{fit.name}: no lens over {fov_deg:.1f} degrees ({error}); fit fewer radial terms"
         ) from error
     observations = fit.observations
-    unit = float(unit_radius(fit.model.projection, np.asarray(half)))
+    unit = float(PROJECTIONS[fit.model.projection].radius(np.asarray(half)))
     return {
         "model": fit.model.projection,
         "cx": fit.cx,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bikeped.geometry import Lens
-from bikeped.geometry.lens import unit_radius
+from bikeped.geometry.lens import PROJECTIONS
 from bikeped.lab.calibration.solver.bundle_adjustment import (
     SOFT_L1_TURN,
     AdjustmentResult,
@@ -100,7 +100,7 @@ class LensFit(AdjustmentResult):
 
     def radius_sigma_px(self, theta: FloatArray) -> FloatArray:
         """One standard deviation of r(theta), from the covariance of f and the radial terms."""
-        base = unit_radius(self.state.projection, theta)
+        base = PROJECTIONS[self.state.projection].radius(theta)
         slopes = [base * radial_factor(theta, self.state.lens[PLAIN:])]
         slopes += [self.focal_px * base * theta ** (2 * n + 2) for n in range(self.model.terms)]
         rows = np.stack(slopes, axis=-1)

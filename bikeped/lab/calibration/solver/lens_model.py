@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.geometry.lens import Projection, unit_angle, unit_radius
+from bikeped.geometry.lens import PROJECTIONS, Projection
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.types import BoolArray, FloatArray, IntArray
 
@@ -132,7 +132,7 @@ class CalibrationState:
     def radius_px(self, theta: FloatArray) -> FloatArray:
         """r(theta), also where no `geometry.Lens` is valid."""
         factor = radial_factor(theta, self.lens[..., PLAIN:])
-        return np.asarray(self.lens[..., 2] * unit_radius(self.projection, theta) * factor)
+        return np.asarray(self.lens[..., 2] * PROJECTIONS[self.projection].radius(theta) * factor)
 
     @property
     def terms(self) -> tuple[float, float, float, float]:
@@ -187,7 +187,7 @@ def bearings(
     """Unit rays [..., 3] in camera axes of pixels [..., 2], for a lens without radial terms."""
     offset = uv_px - centre_px
     radius = np.hypot(offset[..., 0], offset[..., 1])
-    theta = np.minimum(unit_angle(projection, radius / focal_px), np.pi)
+    theta = np.minimum(PROJECTIONS[projection].theta(radius / focal_px), np.pi)
     side = np.sin(theta) / np.where(radius > 0, radius, 1.0)
     return np.concatenate([offset * side[..., None], np.cos(theta)[..., None]], axis=-1)
 

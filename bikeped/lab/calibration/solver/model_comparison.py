@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bikeped.errors import CalibrationError
-from bikeped.geometry.lens import Projection, unit_radius
+from bikeped.geometry.lens import PROJECTIONS, Projection
 from bikeped.lab.calibration.solver.lens_fit import LensFit, fit_lens
 from bikeped.lab.calibration.solver.lens_model import CalibrationState, LensModel, corner_angles
 from bikeped.lab.calibration.solver.normal_equations import single_threaded
@@ -99,7 +99,7 @@ def initial_state(model: LensModel, prepared: PreparedObservations) -> Calibrati
     state, observations = prepared.start, prepared.observations
     theta = corner_angles(state, observations)[observations.visible]
     radius = state.radius_px(theta)
-    base = unit_radius(model.projection, theta)
+    base = PROJECTIONS[model.projection].radius(theta)
     columns = np.stack([base * theta ** (2 * n) for n in range(model.terms + 1)], axis=1)
     size = np.abs(columns).max(0)
     found, *_ = np.linalg.lstsq(columns / size, radius, rcond=None)

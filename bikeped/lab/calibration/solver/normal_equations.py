@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from bikeped.geometry.lens import unit_radius, unit_radius_slope
+from bikeped.geometry.lens import PROJECTIONS
 from bikeped.lab.calibration.solver.lens_model import (
     PLAIN,
     CalibrationState,
@@ -63,10 +63,10 @@ def jacobian(state: CalibrationState, flat: FloatArray, *, bent: bool = True) ->
     theta = np.arctan2(side, z)
 
     k = state.lens[..., PLAIN:]
-    base = unit_radius(state.projection, theta)
+    base = PROJECTIONS[state.projection].radius(theta)
     grown = radial_factor(theta, k)
     unit = base * grown
-    slope = unit_radius_slope(state.projection, theta) * grown + base * _radial_slope(theta, k)
+    slope = PROJECTIONS[state.projection].slope(theta) * grown + base * _radial_slope(theta, k)
     focal = state.lens[..., 2]
     ux, uy = x / side, y / side
 

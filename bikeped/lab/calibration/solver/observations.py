@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from bikeped.errors import CalibrationError
-from bikeped.geometry.lens import LIMITS, Projection, unit_angle, unit_radius
+from bikeped.geometry.lens import PROJECTIONS, Projection
 from bikeped.lab.calibration.board_view import DetectedBoards, RefusedImage
 from bikeped.lab.calibration.solver.board_shape import align_numbering
 from bikeped.lab.calibration.solver.bundle_adjustment import adjust
@@ -82,9 +82,9 @@ def first_guess(
             at = _FARTHEST_DEG.index(best[2])
             around = _FARTHEST_DEG[max(at - 1, 0) : at + 2]
         for angle in around:
-            if np.radians(angle) > LIMITS[projection] * 0.98:
+            if np.radians(angle) > PROJECTIONS[projection].limit_rad * 0.98:
                 continue
-            focal = farthest / float(unit_radius(projection, np.asarray(np.radians(angle))))
+            focal = farthest / float(PROJECTIONS[projection].radius(np.asarray(np.radians(angle))))
             state = poses_from_rays(projection, np.array([*centre, focal]), some, reweighted=2)
             score = float(np.mean(median_errors_px(state, some)))
             if best is None or score < best[0]:
@@ -265,7 +265,7 @@ def _check_fisheye(observations: CornerObservations, state: CalibrationState) ->
     centre = best.state.lens[:2]
     size = np.array([observations.width - 1, observations.height - 1])
     rim = np.hypot(*np.maximum(centre, size - centre)) / best.state.lens[2]
-    theta = float(np.degrees(unit_angle(best.state.projection, np.asarray(rim))))
+    theta = float(np.degrees(PROJECTIONS[best.state.projection].theta(np.asarray(rim))))
     start = first_guess(observations, ("perspective",))
     ordinary = adjust(observations, LensModel("perspective"), start, robust=False)
     fisheye, perspective = (
