@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.types import BoolArray, FloatArray
 

@@ -11,7 +11,7 @@ from bikeped.cli.common import config_options, json_option, write_json
 from bikeped.cli.guard import guarded
 from bikeped.config import framing, ground_camera, load_config
 from bikeped.errors import ConfigError
-from bikeped.geometry import GroundTable
+from bikeped.geometry.camera import GroundTable
 from bikeped.models import model_file
 
 

@@ -11,8 +11,10 @@ from bikeped.config.load import Calibration, LoadedConfig
 from bikeped.config.schema import DecisionConfig, TrackingConfig
 from bikeped.decision.rules import RuleSettings
 from bikeped.errors import ConfigError, GeometryError
-from bikeped.geometry import Framing, GroundCamera, Lens, canonical_projection
-from bikeped.geometry import road_region as region_of
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import Framing
+from bikeped.geometry.framing import road_region as region_of
+from bikeped.geometry.lens import Lens, canonical_projection
 from bikeped.tracking.batch_tracker import TrackerSettings
 from bikeped.types import Region
 

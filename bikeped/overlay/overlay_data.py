@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bikeped.faults import fault_texts
-from bikeped.geometry import Framing, GroundCamera
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import Framing
 from bikeped.overlay.drawing import SIGNAL_COLOUR, Rgb
 from bikeped.types import Decision, Detections, FloatArray, Signal, State, Tracks
 

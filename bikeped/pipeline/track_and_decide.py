@@ -14,7 +14,8 @@ import numpy as np
 
 from bikeped.config import LoadedConfig, framing, ground_camera, rule_settings, tracker_settings
 from bikeped.decision.decider import Decider
-from bikeped.geometry import Framing, GroundTable
+from bikeped.geometry.camera import GroundTable
+from bikeped.geometry.framing import Framing
 from bikeped.tracking.tracker import Tracker, predict
 from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
 

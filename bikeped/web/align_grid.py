@@ -13,7 +13,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.geometry import Framing, GroundCamera
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import Framing
 from bikeped.overlay.drawing import INK, Rgb, draw_text, fill_rect, polyline, text_size
 from bikeped.types import BoolArray, FloatArray, ImageArray
 

@@ -16,7 +16,6 @@ from msgspec import Meta
 
 from bikeped.config import CameraConfig
 from bikeped.errors import BikepedError, GeometryError
-from bikeped.geometry import Framing, GroundCamera
 from bikeped.geometry.alignment import (
     PARAMETER_NAMES,
     Alignment,
@@ -28,6 +27,8 @@ from bikeped.geometry.alignment import (
     pixel_at_distance,
 )
 from bikeped.geometry.alignment_fit import fit_alignment
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import Framing
 
 _Pixel = Annotated[float, Meta(ge=-1e5, le=1e5)]
 _Metres = Annotated[float, Meta(ge=-1000, le=1000)]

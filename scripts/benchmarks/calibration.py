@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from benchmarks.figures import Figures, median_s
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.lab.calibration.capture.images import load_images
 from bikeped.lab.calibration.image_pipeline import detect_boards

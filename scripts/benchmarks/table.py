@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.figures import Figures
 from bikeped.config import framing, ground_camera, load_config
-from bikeped.geometry import GroundTable
+from bikeped.geometry.camera import GroundTable
 
 
 def _measured(build: Callable[[], float]) -> tuple[float, float, float]:

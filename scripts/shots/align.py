@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from bikeped.config import framing, ground_camera, load_config
-from bikeped.geometry import CameraPose
+from bikeped.geometry.camera import CameraPose
 from bikeped.lab.demo.summary import bundled_scenario
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter
 from bikeped.lab.scenarios.scenario import load_scenario

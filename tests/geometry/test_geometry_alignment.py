@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import GroundCamera, Lens
 from bikeped.geometry.alignment import (
     Alignment,
     Mark,
@@ -22,6 +21,8 @@ from bikeped.geometry.alignment import (
     plain_radius_px,
 )
 from bikeped.geometry.alignment_fit import fit_alignment
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.lens import Lens
 
 CAMERA = GroundCamera(Lens.from_circle("equidistant", 1750, 197.9), 1752.69, 1804.54, 3.6576)
 FOUR = ((4.0, -1.5), (6.0, 2.0), (10.0, -3.0), (15.0, 4.0))

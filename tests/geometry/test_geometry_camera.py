@@ -8,7 +8,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import CameraPose, Framing, GroundCamera, Lens
+from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.framing import Framing
+from bikeped.geometry.lens import Lens
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=80)
 WIDEST = {

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import Framing
+from bikeped.geometry.framing import Framing
 
 DEPLOYED = Framing(3840, 2160, 3840, 3500)
 

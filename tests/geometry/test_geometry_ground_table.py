@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import GroundCamera, GroundTable, Lens
+from bikeped.geometry.camera import GroundCamera, GroundTable
+from bikeped.geometry.lens import Lens
 
 CASES = [
     # model, fov, k, radius, side, height, pitch, heading, step

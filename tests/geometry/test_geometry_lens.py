@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import Lens, canonical_projection
+from bikeped.geometry.lens import Lens, canonical_projection
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=60)
 

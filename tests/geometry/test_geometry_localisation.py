@@ -8,7 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from bikeped.geometry import Framing, GroundCamera, Lens
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import Framing
+from bikeped.geometry.lens import Lens
 
 SIZES = {"pedestrian": (0.3, 0.5, 1.7), "cyclist": (1.8, 0.6, 1.7), "car": (4.5, 1.8, 1.5)}
 PAPER = {

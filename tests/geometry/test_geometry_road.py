@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.config import load_config, road_region
-from bikeped.geometry import Framing, GroundCamera, Lens
-from bikeped.geometry import road_region as region_of
-from bikeped.geometry.framing import MAX_HEIGHT_M
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import MAX_HEIGHT_M, Framing
+from bikeped.geometry.framing import road_region as region_of
+from bikeped.geometry.lens import Lens
 from bikeped.types import Region
 
 FRAME = Framing(960, 540)

@@ -6,7 +6,9 @@ import pytest
 
 from bikeped.errors import CaptureError
 from bikeped.faults import Fault
-from bikeped.geometry import Framing, GroundCamera, Lens
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import Framing
+from bikeped.geometry.lens import Lens
 from bikeped.overlay.camera_view import draw_overlay
 from bikeped.overlay.compose import compose, encode_jpeg
 from bikeped.overlay.drawing import INK, KIND_COLOUR, SIGNAL_COLOUR

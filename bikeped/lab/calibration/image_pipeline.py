@@ -14,7 +14,7 @@ import numpy as np
 
 from bikeped.cores import cores
 from bikeped.errors import CalibrationError
-from bikeped.geometry import Framing
+from bikeped.geometry.framing import Framing
 from bikeped.lab.calibration.board_view import (
     BoardPattern,
     BoardRefusedError,

@@ -20,7 +20,7 @@ from bikeped.cli.common import progress_bar, text_table, write_json
 from bikeped.config import LoadedConfig, framing, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
-from bikeped.geometry import canonical_projection
+from bikeped.geometry.lens import canonical_projection
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.capture.coverage import measure_coverage
 from bikeped.lab.calibration.capture.guide import CaptureGuide

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from bikeped.config import DecisionConfig
-from bikeped.geometry import CameraPose, GroundCamera, Lens
+from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.lens import Lens
 from bikeped.lab.experiments.trials import (
     DetectableObjects,
     LossModel,

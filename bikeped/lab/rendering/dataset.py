@@ -14,7 +14,8 @@ import numpy as np
 
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.files import make_folder, whole_folder
-from bikeped.geometry import CameraPose, Lens
+from bikeped.geometry.camera import CameraPose
+from bikeped.geometry.lens import Lens
 from bikeped.lab.rendering.clip import encode_jpeg
 from bikeped.lab.rendering.conditions import Conditions, random_conditions
 from bikeped.lab.rendering.labels import DrawnObject

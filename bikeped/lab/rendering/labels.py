@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.geometry import CameraPose
+from bikeped.geometry.camera import CameraPose
 from bikeped.lab.rendering.sprite import Sprite, overlapping_slices
 from bikeped.types import BoolArray, Float32Array, FloatArray, Kind
 

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bikeped.errors import BikepedError
-from bikeped.geometry import CameraPose, GroundCamera
+from bikeped.geometry.camera import CameraPose, GroundCamera
 from bikeped.lab.scenarios.scenario import SIZES_M, Scenario
 from bikeped.lab.simulation.truth import KIND_OF
 from bikeped.types import BoolArray, FloatArray, Kind, KindArray

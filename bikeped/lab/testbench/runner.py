@@ -18,7 +18,7 @@ import msgspec
 
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError
-from bikeped.geometry import CameraPose
+from bikeped.geometry.camera import CameraPose
 from bikeped.lab.experiments.deployment import fuse_cameras
 from bikeped.lab.experiments.trials import (
     DetectableObjects,

@@ -20,7 +20,7 @@ from msgspec import Meta
 from bikeped.config import DecisionConfig, LoadedConfig, ground_camera
 from bikeped.config.schema import Section
 from bikeped.errors import BikepedError, ScenarioError
-from bikeped.geometry import CameraPose, GroundCamera
+from bikeped.geometry.camera import CameraPose, GroundCamera
 from bikeped.lab.experiments.latency import delay_frames
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
 from bikeped.lab.simulation.perception import SIMULATION_POSE, RecallModel

@@ -18,7 +18,7 @@ import numpy as np
 from bikeped.config import LoadedConfig
 from bikeped.errors import DataSetError
 from bikeped.files import make_folder
-from bikeped.geometry import CameraPose
+from bikeped.geometry.camera import CameraPose
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import SceneCamera, scene_camera
 from bikeped.lab.rendering.dataset import SceneMix, write_dataset

@@ -20,8 +20,8 @@ from bikeped.capture.jpeg import JpegDecoder
 from bikeped.config import LoadedConfig
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import Detector, load_detector
-from bikeped.geometry import road_region
 from bikeped.geometry.boxes import iou_matrix
+from bikeped.geometry.framing import road_region
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, scene_camera
 from bikeped.lab.rendering.clip import encode_jpeg

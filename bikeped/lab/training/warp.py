@@ -27,7 +27,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import GroundCamera, Lens, canonical_projection
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.lens import Lens, canonical_projection
 from bikeped.types import BoolArray, Float32Array, FloatArray, ImageArray
 
 #: Samples of a box's edge, of an object's outline, and of the image circle's rim.

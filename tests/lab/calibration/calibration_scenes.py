@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 import pytest
 from synthetic_boards import BoardBend, DrawnCamera, draw_views, spread_poses
 
-from bikeped.geometry import Lens
-from bikeped.geometry.lens import Projection
+from bikeped.geometry.lens import Lens, Projection
 from bikeped.lab.calibration.board_view import (
     BoardPattern,
     BoardRefusedError,

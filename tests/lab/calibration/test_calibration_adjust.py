@@ -10,8 +10,8 @@ import pytest
 from calibration_scenes import PATTERN, boards, camera, found
 from synthetic_boards import BoardBend, DrawnCamera
 
-from bikeped.geometry import GroundCamera, Lens
-from bikeped.geometry.lens import Projection
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.lens import Lens, Projection
 from bikeped.lab.calibration.board_view import BoardView
 from bikeped.lab.calibration.solver import bundle_adjustment as adjust_module
 from bikeped.lab.calibration.solver import lens_fit as validate_module

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from bikeped.geometry import Lens
-from bikeped.geometry.lens import Projection
+from bikeped.geometry.lens import Lens, Projection
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.solver.lens_model import (
     PLAIN,

@@ -11,7 +11,8 @@ from calibration_scenes import PATTERN, boards, camera, found
 from synthetic_boards import BoardPose, DrawnCamera, draw_views, spread_poses, turn
 
 from bikeped.errors import CalibrationError
-from bikeped.geometry import Framing, Lens
+from bikeped.geometry.framing import Framing
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardRefusedError, BoardView, RefusedImage
 from bikeped.lab.calibration.image_pipeline import crop_view
 from bikeped.lab.calibration.solver.lens_model import LensModel

@@ -14,7 +14,7 @@ from calibration_scenes import refusal_of
 from synthetic_boards import BoardPose, DrawnCamera, spread_poses, true_corners, turn
 
 from bikeped.errors import CalibrationError
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.capture.images import CalibrationImage, load_images
 from bikeped.lab.calibration.corners.board_detector import detect_board

@@ -9,7 +9,7 @@ import pytest
 from board_render import draw_picture
 from synthetic_boards import BoardPose, DrawnCamera, true_corners
 
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.corners import candidates
 from bikeped.lab.calibration.corners.board_detector import detect_board

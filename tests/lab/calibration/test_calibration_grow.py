@@ -8,7 +8,7 @@ import pytest
 from board_render import RenderStyle, draw_picture
 from synthetic_boards import DrawnCamera, spread_poses, true_corners
 
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.corners.grid_growing import find_grids
 from bikeped.types import ImageArray

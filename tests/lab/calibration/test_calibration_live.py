@@ -18,7 +18,7 @@ from synthetic_boards import BoardPose, DrawnCamera, draw_views, spread_poses
 from bikeped.capture import FrameSource
 from bikeped.config.schema import WebConfig
 from bikeped.errors import CalibrationError, CaptureError
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.lab.calibration.capture.coverage import (
     CircleSector,

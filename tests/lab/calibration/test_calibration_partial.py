@@ -12,7 +12,7 @@ from board_render import RenderStyle, draw_picture
 from calibration_scenes import refusal_of
 from synthetic_boards import BoardPose, DrawnCamera, spread_poses, true_corners
 
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardRefusedError
 from bikeped.lab.calibration.capture.images import CalibrationImage
 from bikeped.lab.calibration.corners.board_check import DetectedBoard

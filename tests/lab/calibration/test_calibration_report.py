@@ -17,7 +17,8 @@ from calibration_scenes import boards, camera, found
 
 from bikeped.config import ground_camera, load_config
 from bikeped.errors import CalibrationError
-from bikeped.geometry import Framing, Lens
+from bikeped.geometry.framing import Framing
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import RefusedImage
 from bikeped.lab.calibration.capture.coverage import CircleSector, Coverage
 from bikeped.lab.calibration.capture.images import CalibrationImage

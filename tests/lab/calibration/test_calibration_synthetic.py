@@ -20,7 +20,7 @@ from synthetic_boards import (
 )
 
 from bikeped.errors import GeometryError
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.lab.calibration.corners.corner_refinement import refine_corners
 

@@ -22,7 +22,7 @@ from synthetic_boards import BoardPose, DrawnCamera, spread_poses, turn
 
 from bikeped.cli.main import main
 from bikeped.config import ground_camera, load_config
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.lab.calibration.solver.lens_model import CornerObservations
 from bikeped.lab.cli.calibrate_run import partial_board_lines

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.config import load_config
-from bikeped.geometry import GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, ScenePainter, scene_camera
 from bikeped.lab.rendering.conditions import lighting
 from bikeped.lab.rendering.people import Appearance, person

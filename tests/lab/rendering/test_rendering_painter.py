@@ -11,7 +11,7 @@ import pytest
 
 from bikeped.config import load_config
 from bikeped.errors import GeometryError, ScenarioError
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter, scene_camera
 from bikeped.lab.rendering.backdrop import backdrop
 from bikeped.lab.rendering.compositing import paste_sprite

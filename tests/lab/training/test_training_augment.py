@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import DataSetError, GeometryError
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.training.augment import (
     AugmentSettings,
     augment_data,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardRefusedError, BoardView
 from bikeped.lab.calibration.capture.coverage import Coverage, corner_counts, measure_coverage
 from bikeped.lab.calibration.corners.board_check import DetectedBoard, rms_shift_px

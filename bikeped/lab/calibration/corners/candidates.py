@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bikeped.geometry import Lens
+from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern
 from bikeped.types import Float32Array, FloatArray, ImageArray
 

@@ -15,7 +15,7 @@ import numpy as np
 from bikeped import __version__
 from bikeped.errors import CalibrationError, GeometryError
 from bikeped.files import write_whole
-from bikeped.geometry import Framing
+from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import PROJECTIONS
 from bikeped.lab.calibration.capture.coverage import Coverage
 from bikeped.lab.calibration.solver.lens_fit import LensFit, rms_by_image

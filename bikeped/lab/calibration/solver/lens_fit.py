@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bikeped.geometry import Lens
-from bikeped.geometry.lens import PROJECTIONS
+from bikeped.geometry.lens import PROJECTIONS, Lens
 from bikeped.lab.calibration.solver.bundle_adjustment import (
     SOFT_L1_TURN,
     AdjustmentResult,
