@@ -43,8 +43,7 @@ class Alignment:
     @staticmethod
     def of(camera: GroundCamera) -> Alignment:
         """The parameters of `camera`."""
-        c = camera
-        radius_px = plain_radius_px(c.lens)
+        c, radius_px = camera, plain_radius_px(camera.lens)
         return Alignment(c.height_m, c.pitch_deg, radius_px, c.cx, c.cy, c.heading_deg)
 
     def camera(self, like: GroundCamera) -> GroundCamera:

@@ -325,8 +325,13 @@ class _Problem:
                 for name in self.free
             )
             if apart and other_score < score + 4:
-                both = " or ".join(_values_text(x, self.free) for x in (best, other))
-                raise GeometryError(f"two solutions fit: {both}; add a mark at another distance")
+                one, two = (
+                    " ".join(f"{PARAMETER_NAMES[n]} {getattr(x, n):.2f}" for n in self.free)
+                    for x in (best, other)
+                )
+                raise GeometryError(
+                    f"two solutions fit: {one} or {two}; add a mark at another distance"
+                )
 
     def residuals(self, best: Alignment) -> tuple[Residual, ...]:
         """Each measurement beside the camera's reading."""
@@ -356,18 +361,12 @@ class _Problem:
 
 def _measure(quantity: str, xy_m: FloatArray, other_m: FloatArray) -> FloatArray:
     """The measured quantity [5] of positions [5, 2]."""
-    if quantity == "distance":
-        return np.asarray(np.hypot(xy_m[:, 0], xy_m[:, 1]))
-    if quantity == "spacing":
-        return np.asarray(np.hypot(xy_m[:, 0] - other_m[0], xy_m[:, 1] - other_m[1]))
-    return np.asarray(xy_m[:, 0 if quantity == "forward" else 1])
+    if quantity in ("forward", "right"):
+        return np.asarray(xy_m[:, 0 if quantity == "forward" else 1])
+    return np.asarray(np.hypot(*(xy_m - (other_m if quantity == "spacing" else 0)).T))
 
 
 def _names(keys: Sequence[str]) -> str:
     """Names of parameters in a sentence: `height, pitch and radius`."""
     *most, last = (PARAMETER_NAMES[key] for key in keys)
     return f"{', '.join(most)} and {last}" if most else last
-
-
-def _values_text(alignment: Alignment, names: Sequence[str]) -> str:
-    return " ".join(f"{PARAMETER_NAMES[name]} {getattr(alignment, name):.2f}" for name in names)

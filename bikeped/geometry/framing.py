@@ -33,32 +33,32 @@ class Framing:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.pad_size is not None and self.pad_size < max(self.sensor_w, self.sensor_h):
+        longest, (width, height) = max(self.sensor_w, self.sensor_h), self._padded
+        if self.pad_size is not None and self.pad_size < longest:
             raise GeometryError(
                 f"camera.pad_size: {self.pad_size} is smaller than the sensor "
-                f"({self.sensor_w} x {self.sensor_h}); use at least "
-                f"{max(self.sensor_w, self.sensor_h)}"
+                f"({self.sensor_w} x {self.sensor_h}); use at least {longest}"
             )
-        if self.crop_size is not None and self.crop_size > min(self._padded()):
+        if self.crop_size is not None and self.crop_size > min(width, height):
             raise GeometryError(
                 f"camera.crop_size: {self.crop_size} is larger than the frame it is cut from "
-                f"({self._padded()[0]} x {self._padded()[1]}); lower it or raise camera.pad_size"
+                f"({width} x {height}); lower it or raise camera.pad_size"
             )
 
+    @property
     def _padded(self) -> tuple[int, int]:
-        if self.pad_size is None:
-            return self.sensor_w, self.sensor_h
-        return self.pad_size, self.pad_size
+        side = self.pad_size
+        return (self.sensor_w, self.sensor_h) if side is None else (side, side)
 
     @property
     def crop_wh(self) -> tuple[int, int]:
         """Width and height of the crop, in sensor pixels."""
-        return self._padded() if self.crop_size is None else (self.crop_size, self.crop_size)
+        return self._padded if self.crop_size is None else (self.crop_size, self.crop_size)
 
     @property
     def offset_px(self) -> tuple[int, int]:
         """Sensor pixel (0, 0) in the crop."""
-        (pw, ph), (cw, ch) = self._padded(), self.crop_wh
+        (pw, ph), (cw, ch) = self._padded, self.crop_wh
         left, top = (pw - self.sensor_w) // 2, (ph - self.sensor_h) // 2
         return left - (pw - cw) // 2, top - (ph - ch) // 2
 
@@ -85,13 +85,11 @@ class Framing:
 
     def frame_to_crop(self, uv_px: npt.ArrayLike) -> FloatArray:
         """Frame pixels [..., 2] in the crop."""
-        uv: FloatArray = np.asarray(uv_px, dtype=np.float64) * self.scale
-        return uv + np.asarray(self.offset_px, dtype=np.float64)
+        return np.asarray(np.asarray(uv_px, np.float64) * self.scale + self.offset_px)
 
     def crop_to_frame(self, uv_px: npt.ArrayLike) -> FloatArray:
         """Crop pixels [..., 2] in the frame."""
-        uv: FloatArray = np.asarray(uv_px, np.float64) - np.asarray(self.offset_px, np.float64)
-        return uv / self.scale
+        return (np.asarray(uv_px, np.float64) - self.offset_px) / self.scale
 
 
 def road_region(camera: GroundCamera, framing: Framing, range_m: float) -> Region:
@@ -118,7 +116,6 @@ def road_region(camera: GroundCamera, framing: Framing, range_m: float) -> Regio
         return Region(0.0, 0.0, 1.0, 1.0, aspect)
     low = np.maximum(uv[seen].min(axis=0) - margin, axis - rim)
     high = np.minimum(uv[seen].max(axis=0) + margin, axis + rim)
-    offset = np.asarray(framing.offset_px, np.float64)
-    left, top = np.clip((low - offset) / size, 0, 1).tolist()
-    right, bottom = np.clip((high - offset) / size, 0, 1).tolist()
+    left, top = np.clip((low - framing.offset_px) / size, 0, 1).tolist()
+    right, bottom = np.clip((high - framing.offset_px) / size, 0, 1).tolist()
     return Region(left, top, right, bottom, aspect)
