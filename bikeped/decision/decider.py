@@ -32,7 +32,7 @@ class Decider:
     def decide(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> Decision:
         """The decision at `time_s` (s); `ids` [n] ascending, `kind` [n], `xy_m` [n, 2] (m)."""
         rows, newest = self._buffer.append(time_s, ids, kind, xy_m)
-        pairs = pair_rows(rows, self._buffer.frames, newest)
+        pairs = pair_rows(rows, newest)
         checks = evaluate_rule(rows, pairs, self.settings)
         if np.count_nonzero(kind == CYCLIST):
             self._last_cyclist_s = time_s

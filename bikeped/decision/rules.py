@@ -15,13 +15,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.decision.track_rows import IndexArray, Pairs, TrackRows
+from bikeped.decision.track_rows import EPSILON_S, IndexArray, Pairs, TrackRows
 from bikeped.types import BoolArray, FloatArray, State
 
 RuleName = Literal["pairwise", "naive", "ttc", "distance"]
 
-#: Two frames closer in time than this are the same moment (rounding of i / 30).
-EPSILON_S = 1e-6
 #: Distances closer than this are equal: at a constant gap, rounding must not look like closing.
 EPSILON_M = 1e-9
 #: Closing speed below which the ttc rule sees no approach, m/s.

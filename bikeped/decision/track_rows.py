@@ -7,7 +7,8 @@ the simulation holds a suite of scenarios and evaluates all frames at once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,8 @@ from bikeped.types import FloatArray, IntArray, Kind, KindArray
 
 IndexArray = npt.NDArray[np.intp]
 
+#: Two frames closer in time than this are the same moment (rounding of i / 30).
+EPSILON_S = 1e-6
 # Plain integers: numpy looks up an enum's attributes at every comparison.
 CYCLIST, PEDESTRIAN = int(Kind.CYCLIST), int(Kind.PEDESTRIAN)
 
@@ -38,22 +41,6 @@ class TrackRows:
     def __len__(self) -> int:
         return len(self.frame)
 
-    @staticmethod
-    def zeros(count: int) -> TrackRows:
-        """`count` rows to be filled in."""
-        return TrackRows(
-            np.zeros(count, np.intp),
-            np.zeros(count),
-            np.zeros(count, np.int64),
-            np.zeros(count, np.int8),
-            np.zeros((count, 2)),
-            np.zeros(count, np.intp),
-        )
-
-    def view(self, first: int, end: int) -> TrackRows:
-        """The rows from `first` to before `end`; the arrays are shared."""
-        return TrackRows(*(array[first:end] for array in vars(self).values()))
-
 
 @dataclass(frozen=True)
 class Pairs:
@@ -71,11 +58,8 @@ class Pairs:
         return len(self.cyclist)
 
 
-def pair_rows(rows: TrackRows, frames: int, first_row: int = 0) -> Pairs:
-    """All cyclist-pedestrian pairs within each frame, of the rows from `first_row` on.
-
-    `frames` is greater than the last frame's number.
-    """
+def pair_rows(rows: TrackRows, first_row: int = 0) -> Pairs:
+    """All cyclist-pedestrian pairs within each frame, of the rows from `first_row` on."""
     kind = rows.kind[first_row:]
     cyclist_row = (kind == CYCLIST).nonzero()[0] + first_row
     pedestrian_row = (kind == PEDESTRIAN).nonzero()[0] + first_row
@@ -85,7 +69,7 @@ def pair_rows(rows: TrackRows, frames: int, first_row: int = 0) -> Pairs:
     if rows.frame[first_row] == rows.frame[-1]:  # one frame: all combinations
         cyclist = np.arange(cyclists).repeat(pedestrians)
         return Pairs(cyclist_row, cyclist, pedestrian_row[None].repeat(cyclists, axis=0).ravel())
-    count = np.bincount(rows.frame[pedestrian_row], minlength=frames)
+    count = np.bincount(rows.frame[pedestrian_row], minlength=rows.frame[-1] + 1)
     start = count.cumsum() - count
     frame = rows.frame[cyclist_row]
     times = count[frame]
@@ -96,68 +80,41 @@ def pair_rows(rows: TrackRows, frames: int, first_row: int = 0) -> Pairs:
 
 
 class RowBuffer:
-    """Rows of at least the last `span_s` seconds, appended frame by frame.
+    """Rows of at least the last `span_s` seconds, appended frame by frame."""
 
-    The arrays are allocated once and filled from the front; when they are full, every few seconds,
-    the frames within the span move to the front.
-    """
-
-    def __init__(self, span_s: float, capacity: int = 512) -> None:
+    def __init__(self, span_s: float) -> None:
         self._span_s = span_s
-        self._starts: list[tuple[float, int]] = []  #: time and first row of each frame held
-        self._used = 0
-        self._rows = TrackRows.zeros(capacity)
-
-    @property
-    def frames(self) -> int:
-        """Number of frames held."""
-        return len(self._starts)
+        self._last_s = -math.inf
+        self._last_count = 0  #: tracks in the last frame
+        none = np.zeros(0, np.intp)
+        self._rows = TrackRows(
+            none, np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 2)), none
+        )
 
     def append(
         self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray
     ) -> tuple[TrackRows, int]:
         """Adds the frame at `time_s`; returns all rows held and the index of its first row.
 
-        `ids` [n] ascending, `kind` [n], `xy_m` [n, 2] (m). The rows are views, valid until the next
-        call. ValueError when time does not advance.
+        `ids` [n] ascending, `kind` [n], `xy_m` [n, 2] (m). ValueError when time does not advance.
         """
-        if self._starts and time_s <= self._starts[-1][0]:
-            raise ValueError(
-                f"time_s: {time_s} is not after the last frame's {self._starts[-1][0]}"
-            )
-        count = len(ids)
-        # Empty frames fill no rows, but they count: a quiet night has a million of them.
-        if self._used + count > len(self._rows) or len(self._starts) >= len(self._rows):
-            self._make_room(time_s, count)
-        last = self._starts[-1][1] if self._starts else 0
-        first, end = self._used, self._used + count
-        before, new = self._rows.id[last:first], self._rows.view(first, end)
-        new.previous[:] = -1
+        if time_s <= self._last_s:
+            raise ValueError(f"time_s: {time_s} is not after the last frame's {self._last_s}")
+        old, count = self._rows, len(ids)
+        # One frame beyond the span is kept: the older neighbour of an interpolation.
+        cut = int(old.time_s.searchsorted(time_s - self._span_s - EPSILON_S))
+        if cut:
+            cut = int(old.time_s.searchsorted(old.time_s[cut - 1]))
+        first = len(old) - cut
+        before = old.id[len(old) - self._last_count :]
+        previous: IndexArray = np.full(count, -1, np.intp)
         if count and len(before):
             place = np.minimum(before.searchsorted(ids), len(before) - 1)
-            new.previous[:] = np.where(before[place] == ids, place + last, -1)
-        new.frame[:] = len(self._starts)
-        new.time_s[:] = time_s
-        new.id[:], new.kind[:], new.xy_m[:] = ids, kind, xy_m
-        self._starts.append((time_s, first))
-        self._used = end
-        return self._rows.view(0, end), first
-
-    def _make_room(self, time_s: float, count: int) -> None:
-        """Moves the frames within the span to the front, into larger arrays where needed."""
-        starts = self._starts
-        # One frame beyond the span is kept: the older neighbour of an interpolation.
-        drop = 0
-        while drop + 2 < len(starts) and starts[drop + 1][0] < time_s - self._span_s - 1e-6:
-            drop += 1
-        cut = starts[drop][1] if starts else 0
-        kept = self._used - cut
-        old = self._rows.view(cut, self._used)
-        self._rows = TrackRows.zeros(max(len(self._rows), 4 * (kept + count)))
-        new = self._rows.view(0, kept)
-        new.frame[:] = old.frame - drop
-        new.time_s[:], new.id[:] = old.time_s, old.id
-        new.kind[:], new.xy_m[:] = old.kind, old.xy_m
-        new.previous[:] = np.maximum(old.previous - cut, -1)
-        self._starts = [(t, row - cut) for t, row in starts[drop:]]
-        self._used = kept
+            previous = np.where(before[place] == ids, place + first - len(before), -1)
+        frame = old.frame[-1] + 1 if len(old) else 0
+        new = TrackRows(np.full(count, frame), np.full(count, time_s), ids, kind, xy_m, previous)
+        kept = replace(old, previous=np.maximum(old.previous - cut, -1))
+        pairs = zip(vars(kept).values(), vars(new).values(), strict=True)
+        self._rows = TrackRows(*(np.concatenate([past[cut:], now]) for past, now in pairs))
+        self._last_s, self._last_count = time_s, count
+        return self._rows, first

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 
 from bikeped.config import framing, ground_camera, load_config
-from bikeped.geometry.camera import CameraPose
 from bikeped.lab.demo.summary import bundled_scenario
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter
 from bikeped.lab.scenarios.scenario import load_scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

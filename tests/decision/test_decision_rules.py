@@ -280,13 +280,13 @@ def test_no_rows_and_no_pairs():
     none = np.zeros(0, np.intp)
     rows = TrackRows(none, np.zeros(0), none, np.zeros(0, np.int8), np.zeros((0, 2)), none)
     for rule in RULES:
-        verdicts = evaluate_rule(rows, pair_rows(rows, 3), replace(SELECTED, rule=rule))
+        verdicts = evaluate_rule(rows, pair_rows(rows), replace(SELECTED, rule=rule))
         assert len(verdicts.fires) == 0
     one = TrackRows(
         np.zeros(1, np.intp), np.zeros(1), np.ones(1, np.intp), np.ones(1, np.int8),
         np.zeros((1, 2)), np.full(1, -1),
     )  # fmt: skip
-    assert len(pair_rows(one, 1)) == 0
+    assert len(pair_rows(one)) == 0
 
 
 def test_vehicles_are_no_cyclists_and_no_pedestrians():

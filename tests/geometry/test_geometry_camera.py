@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import GeometryError
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import Lens
 
@@ -202,28 +202,6 @@ def test_height_must_be_above_the_ground():
     for height in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(GeometryError, match="height_m"):
             deployed(height_m=height)
-
-
-@repeatable
-@given(
-    st.floats(-50, 50), st.floats(-50, 50), st.floats(-360, 360), st.floats(-40, 40),
-    st.floats(-40, 40),
-)  # fmt: skip
-def test_world_pose_round_trip_and_written_out(cx, cy, heading, x, y):
-    pose = CameraPose(cx, cy, heading)
-    ground = pose.world_to_ground([[x, y]])
-    h = math.radians(heading)
-    forward = (x - cx) * math.cos(h) + (y - cy) * math.sin(h)
-    right = (x - cx) * math.sin(h) - (y - cy) * math.cos(h)
-    np.testing.assert_allclose(ground[0], (forward, right), atol=1e-9)
-    np.testing.assert_allclose(pose.ground_to_world(ground)[0], (x, y), atol=1e-9)
-
-
-def test_the_simulations_camera_looks_north():
-    pose = CameraPose(5.0, -13.0, 90.0)
-    # North of the camera is forward; east of it is to its right.
-    np.testing.assert_allclose(pose.world_to_ground([5.0, -3.0]), (10.0, 0.0), atol=1e-12)
-    np.testing.assert_allclose(pose.world_to_ground([8.0, -13.0]), (0.0, 3.0), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.config import DecisionConfig
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.lens import Lens
 from bikeped.lab.experiments.trials import (
     DetectableObjects,
@@ -33,6 +33,7 @@ from bikeped.lab.experiments.trials import (
 from bikeped.lab.process_pool import ProgressCallback, no_progress
 from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
 from bikeped.lab.simulation.truth import compute_ground_truth

@@ -14,7 +14,6 @@ import numpy as np
 
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.files import make_folder, whole_folder
-from bikeped.geometry.camera import CameraPose
 from bikeped.geometry.lens import Lens
 from bikeped.lab.rendering.clip import encode_jpeg
 from bikeped.lab.rendering.conditions import Conditions, random_conditions
@@ -27,6 +26,7 @@ from bikeped.lab.rendering.render_camera import (
     rectilinear_camera,
 )
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.types import ImageArray, Kind
 
 _DURATION_S = 6.0

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.geometry.camera import CameraPose
 from bikeped.lab.rendering.sprite import Sprite, overlapping_slices
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.types import BoolArray, Float32Array, FloatArray, Kind
 
 #: What each kind of agent counts as: the default configuration's classes.

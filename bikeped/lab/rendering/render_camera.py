@@ -15,9 +15,10 @@ import numpy as np
 
 from bikeped.config import LoadedConfig, framing, ground_camera
 from bikeped.errors import GeometryError
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import Lens
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.types import BoolArray, Float32Array, FloatArray
 
 #: Where the paper's simulation camera stands: south of the crossing, looking north.

@@ -19,8 +19,9 @@ from typing import Any, Literal
 import numpy as np
 
 from bikeped.errors import BikepedError
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.scenarios.scenario import SIZES_M, Scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.truth import KIND_OF
 from bikeped.types import BoolArray, FloatArray, Kind, KindArray
 

@@ -189,7 +189,7 @@ def build_rule_input(history: TrackHistory, order: int = 0) -> RuleInput:
         np.maximum.accumulate(part, out=part)
     return RuleInput(
         rows=rows,
-        pairs=pair_rows(rows, total),
+        pairs=pair_rows(rows),
         start=start,
         frames=history.frames,
         time_s=time_s,

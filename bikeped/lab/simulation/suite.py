@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from bikeped import __version__
 from bikeped.config import DecisionConfig, LoadedConfig, ground_camera, rule_settings
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.metrics import GroundTruthFrames, Metrics, measure
 from bikeped.lab.simulation.perception import SIMULATION_POSE, PerceptionResult, simulate_perception
 from bikeped.lab.simulation.simulate import (

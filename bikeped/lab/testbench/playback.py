@@ -16,7 +16,8 @@ from bikeped.config import DecisionConfig, rule_settings
 from bikeped.decision.decider import explain, pair_metrics, select_pair
 from bikeped.decision.episodes import onsets
 from bikeped.decision.rules import PairChecks, is_remembered
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.metrics import finite_or_none, measure
 from bikeped.lab.simulation.simulate import FPS, verdicts
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruth

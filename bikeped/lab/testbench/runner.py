@@ -18,7 +18,6 @@ import msgspec
 
 from bikeped.config import LoadedConfig
 from bikeped.errors import BikepedError
-from bikeped.geometry.camera import CameraPose
 from bikeped.lab.experiments.deployment import fuse_cameras
 from bikeped.lab.experiments.trials import (
     DetectableObjects,
@@ -27,6 +26,7 @@ from bikeped.lab.experiments.trials import (
     summarize_metrics,
 )
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.metrics import GroundTruthFrames
 from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
 from bikeped.lab.simulation.simulate import (

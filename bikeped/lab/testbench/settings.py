@@ -20,9 +20,10 @@ from msgspec import Meta
 from bikeped.config import DecisionConfig, LoadedConfig, ground_camera
 from bikeped.config.schema import Section
 from bikeped.errors import BikepedError, ScenarioError
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.experiments.latency import delay_frames
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.perception import SIMULATION_POSE, RecallModel
 from bikeped.lab.simulation.truth import GroundTruthSettings
 

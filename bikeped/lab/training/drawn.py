@@ -18,11 +18,11 @@ import numpy as np
 from bikeped.config import LoadedConfig
 from bikeped.errors import DataSetError
 from bikeped.files import make_folder
-from bikeped.geometry.camera import CameraPose
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.rendering import SceneCamera, scene_camera
 from bikeped.lab.rendering.dataset import SceneMix, write_dataset
 from bikeped.lab.rendering.render_camera import DEFAULT_POSE
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.training.coco import write_annotations
 
 #: Seeds of a set's parts begin at its seed times this: sets share no street.

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from bikeped.config import rule_settings
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.perception import SIMULATION_POSE
 from bikeped.lab.simulation.simulate import DetectionSequence, build_rule_input, states, track
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
@@ -185,3 +186,25 @@ def test_turned_and_later_at_once(suite, index, angle, frames):
     scenario = suite.scenarios[index]
     plain, moved = decided([scenario, later(turned(scenario, angle), frames)])
     assert moved == [0] * frames + plain
+
+
+@QUICK
+@given(
+    st.floats(-50, 50), st.floats(-50, 50), st.floats(-360, 360), st.floats(-40, 40),
+    st.floats(-40, 40),
+)  # fmt: skip
+def test_world_pose_round_trip_and_written_out(cx, cy, heading, x, y):
+    pose = CameraPose(cx, cy, heading)
+    ground = pose.world_to_ground([[x, y]])
+    h = np.radians(heading)
+    forward = (x - cx) * np.cos(h) + (y - cy) * np.sin(h)
+    right = (x - cx) * np.sin(h) - (y - cy) * np.cos(h)
+    np.testing.assert_allclose(ground[0], (forward, right), atol=1e-9)
+    np.testing.assert_allclose(pose.ground_to_world(ground)[0], (x, y), atol=1e-9)
+
+
+def test_the_simulations_camera_looks_north():
+    pose = CameraPose(5.0, -13.0, 90.0)
+    # North of the camera is forward; east of it is to its right.
+    np.testing.assert_allclose(pose.world_to_ground([5.0, -3.0]), (10.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(pose.world_to_ground([8.0, -13.0]), (0.0, 3.0), atol=1e-12)
