@@ -28,7 +28,8 @@ from typing import Any
 import msgspec
 
 from bikeped import __version__
-from bikeped.config import LoadedConfig, load_config, road_region
+from bikeped.config.build import road_region
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.base import sha256_of

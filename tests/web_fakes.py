@@ -9,7 +9,7 @@ import numpy as np
 import simplejpeg
 from prometheus_client import CollectorRegistry
 
-from bikeped.config import LoadedConfig, parse_config
+from bikeped.config.load import LoadedConfig, parse_config
 from bikeped.faults import Fault
 from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.detection_scheduler import DecodedFrame

@@ -19,7 +19,8 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import guarded
-from bikeped.config import LoadedConfig, framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.errors import BikepedError, CaptureError
 from bikeped.files import write_whole
 from bikeped.types import Frame

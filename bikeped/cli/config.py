@@ -9,7 +9,8 @@ import msgspec
 
 from bikeped.cli.common import config_options, json_option, write_json
 from bikeped.cli.guard import guarded
-from bikeped.config import framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import load_config
 from bikeped.errors import ConfigError
 from bikeped.geometry.camera import GroundTable
 from bikeped.models import model_file

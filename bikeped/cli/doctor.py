@@ -10,7 +10,7 @@ import click
 
 from bikeped.cli.common import config_options, console, json_option, text_table, write_json
 from bikeped.cli.guard import guarded
-from bikeped.config import default_config_path, load_config
+from bikeped.config.load import default_config_path, load_config
 from bikeped.errors import BikepedError
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.files import make_folder
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 
 from bikeped import __version__
-from bikeped.config import LoadedConfig, road_region
+from bikeped.config.build import road_region
+from bikeped.config.load import LoadedConfig
 from bikeped.cores import cores
 from bikeped.detection.base import load_detector
 from bikeped.errors import DetectorError

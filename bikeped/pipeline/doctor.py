@@ -25,7 +25,7 @@ import numpy as np
 
 from bikeped.capture import open_source
 from bikeped.capture.jpeg import JpegDecoder
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.errors import BikepedError, CaptureError
 from bikeped.feedback import open_light
 from bikeped.feedback.light import LAMP_COLOURS

@@ -7,7 +7,8 @@ import math
 import time
 from collections.abc import Callable
 
-from bikeped.capture import FrameGrabber, FrameSource
+from bikeped.capture.base import FrameSource
+from bikeped.capture.frame_grabber import FrameGrabber
 from bikeped.pipeline.runtime import WorkerThread
 from bikeped.types import Frame
 

@@ -13,8 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bikeped.capture import FrameSource, PacedSource, open_source
-from bikeped.config import LoadedConfig
+from bikeped.capture import open_source
+from bikeped.capture.base import FrameSource
+from bikeped.capture.recordings import PacedSource
+from bikeped.config.load import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback.light import LightDriver, SimulatedLight

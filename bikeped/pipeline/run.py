@@ -12,8 +12,11 @@ from functools import partial
 from typing import Any
 
 from bikeped import __version__
-from bikeped.capture import FrameGrabber, FrameSource, PacedSource, open_source
-from bikeped.config import LoadedConfig
+from bikeped.capture import open_source
+from bikeped.capture.base import FrameSource
+from bikeped.capture.frame_grabber import FrameGrabber
+from bikeped.capture.recordings import PacedSource
+from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
 from bikeped.feedback import light_driver

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import cast
 
 from bikeped import __version__
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
 from bikeped.feedback.light import LightDriver

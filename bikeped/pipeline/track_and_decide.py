@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bikeped.config import LoadedConfig, framing, ground_camera, rule_settings, tracker_settings
+from bikeped.config.build import framing, ground_camera, rule_settings, tracker_settings
+from bikeped.config.load import LoadedConfig
 from bikeped.decision.decider import Decider
 from bikeped.geometry.camera import GroundTable
 from bikeped.geometry.framing import Framing

@@ -19,7 +19,9 @@ import simplejpeg
 from aiohttp import hdrs, web
 from msgspec import Meta
 
-from bikeped.config import CameraConfig, LoadedConfig, framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import LoadedConfig, load_config
+from bikeped.config.schema import CameraConfig
 from bikeped.errors import GeometryError
 from bikeped.geometry.alignment import PARAMETER_NAMES, Alignment
 from bikeped.types import Frame

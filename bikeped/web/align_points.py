@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from bikeped.config import CameraConfig
+from bikeped.config.schema import CameraConfig
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.geometry.alignment import (
     PARAMETER_NAMES,

@@ -10,8 +10,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import bikeped
-from bikeped.config import load_config, parse_config
 from bikeped.config.edit import section_lines, set_values
+from bikeped.config.load import load_config, parse_config
 from bikeped.config.provenance import provenance_path
 from bikeped.errors import ConfigError
 from bikeped.files import write_like

@@ -7,7 +7,7 @@ from functools import partial
 import msgspec
 from aiohttp import web
 
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.loop import FrameResult
 from bikeped.telemetry.http_server import add_monitoring

@@ -6,7 +6,8 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.figures import Figures, in_turns, seconds
-from bikeped.config import LoadedConfig, load_config, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.cores import cores
 from bikeped.decision.decider import Decider
 from bikeped.lab.experiments import optimizer

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.figures import Figures, in_turns
 from benchmarks.loop import street_4k
-from bikeped.capture import JpegDecoder
+from bikeped.capture.jpeg import JpegDecoder
 from bikeped.detection.nms import non_max_suppression
 from bikeped.detection.preprocess import Preprocessor
 

@@ -14,7 +14,7 @@ import numpy as np
 import onnxruntime as ort
 
 from benchmarks.figures import Figures
-from bikeped.config import LoadedConfig, load_config
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.lab.demo.summary import bundled_scenario

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 
 from benchmarks.figures import Figures, in_turns
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter, scene_camera
 from bikeped.lab.rendering.backdrop import backdrop
 from bikeped.lab.rendering.dataset import random_scenario

@@ -10,7 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.figures import Figures
-from bikeped.config import framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import load_config
 from bikeped.geometry.camera import GroundTable
 
 

@@ -34,7 +34,8 @@ def run(figures: Figures) -> None:
         print("testbench: skipped, playwright is not installed (pip install bikeped[test])")
         return
     from benchmarks.figures import in_turns
-    from bikeped.config import DecisionConfig, load_config
+    from bikeped.config.load import load_config
+    from bikeped.config.schema import DecisionConfig
     from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
     from bikeped.lab.simulation.suite import Suite
 

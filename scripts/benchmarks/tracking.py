@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.figures import Figures, in_turns
-from bikeped.config import load_config, rule_settings, tracker_settings
+from bikeped.config.build import rule_settings, tracker_settings
+from bikeped.config.load import load_config
 from bikeped.decision.decider import Decider
 from bikeped.tracking.tracker import Tracker
 from bikeped.types import GroundPoints

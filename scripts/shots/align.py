@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from bikeped.config import framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import load_config
 from bikeped.lab.demo.summary import bundled_scenario
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter
 from bikeped.lab.scenarios.scenario import load_scenario

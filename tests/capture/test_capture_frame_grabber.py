@@ -10,8 +10,9 @@ import threading
 
 import pytest
 
-from bikeped.capture import FrameGrabber, FrameSource, PacedSource, VideoSource
-from bikeped.capture.frame_grabber import backoff_s
+from bikeped.capture.base import FrameSource
+from bikeped.capture.frame_grabber import FrameGrabber, backoff_s
+from bikeped.capture.recordings import PacedSource, VideoSource
 from bikeped.errors import CaptureError
 from bikeped.types import Frame
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.capture import JpegDecoder, read_size
+from bikeped.capture.jpeg import JpegDecoder, read_size
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT = 320, 240

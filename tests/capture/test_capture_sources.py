@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.capture import ImageSource, JpegDecoder, NetworkSource, open_source
-from bikeped.capture.cameras import without_password
-from bikeped.config import CameraConfig
+from bikeped.capture import open_source
+from bikeped.capture.cameras import NetworkSource, without_password
+from bikeped.capture.jpeg import JpegDecoder
+from bikeped.capture.recordings import ImageSource
+from bikeped.config.schema import CameraConfig
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT = 96, 64

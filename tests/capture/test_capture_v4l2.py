@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.capture import V4l2Source, read_size
-from bikeped.capture.cameras import MAX_REPEATING_S, trim
+from bikeped.capture.cameras import MAX_REPEATING_S, V4l2Source, trim
+from bikeped.capture.jpeg import read_size
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT = 96, 64

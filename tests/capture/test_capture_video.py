@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from shared_inputs import CLIP, missing
 
-from bikeped.capture import JpegDecoder, VideoSource, open_source
-from bikeped.config import CameraConfig
+from bikeped.capture import open_source
+from bikeped.capture.jpeg import JpegDecoder
+from bikeped.capture.recordings import VideoSource
+from bikeped.config.schema import CameraConfig
 from bikeped.errors import CaptureError
 
 WIDTH, HEIGHT, FPS = 96, 64, 25.0

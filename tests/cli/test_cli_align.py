@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from bikeped.cli.main import main
-from bikeped.config import framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import load_config
 from bikeped.geometry.alignment import Alignment
 
 #: Metres ahead and to the right; the small camera looks down at them.

@@ -10,8 +10,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config import DecisionConfig, parse_config, parse_decision
 from bikeped.config.edit import replace_section, section_lines, set_values
+from bikeped.config.load import parse_config, parse_decision
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import ConfigError
 
 

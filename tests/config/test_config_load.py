@@ -12,18 +12,15 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config import (
+from bikeped.config.build import framing, ground_camera, rule_settings, tracker_settings
+from bikeped.config.load import (
     LoadedConfig,
     config_hash,
     default_config_path,
-    framing,
-    ground_camera,
+    load_calibration,
     load_config,
     parse_config,
-    rule_settings,
-    tracker_settings,
 )
-from bikeped.config.load import load_calibration
 from bikeped.config.schema import Config
 from bikeped.config.validate import known_keys
 from bikeped.errors import BikepedError, CalibrationError, ConfigError

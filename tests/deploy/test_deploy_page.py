@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from bikeped.config import framing, load_config
+from bikeped.config.build import framing
+from bikeped.config.load import load_config
 from bikeped.config.schema import Config
 from bikeped.errors import GeometryError
 from bikeped.faults import Fault

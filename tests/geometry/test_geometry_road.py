@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config import load_config, road_region
+from bikeped.config.build import road_region
+from bikeped.config.load import load_config
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import MAX_HEIGHT_M, Framing
 from bikeped.geometry.framing import road_region as region_of

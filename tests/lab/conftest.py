@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.suite import Suite
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from bikeped.cli.main import main
-from bikeped.config import load_config, road_region
+from bikeped.config.build import road_region
+from bikeped.config.load import load_config
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import load_detector
 from bikeped.detection.base import sha256_of

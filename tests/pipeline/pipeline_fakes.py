@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bikeped.config import LoadedConfig, parse_config
+from bikeped.config.load import LoadedConfig, parse_config
 from bikeped.detection.base import DetectionResult
 from bikeped.faults import Fault, fault_texts
 from bikeped.feedback.signal_logic import SignalLogic

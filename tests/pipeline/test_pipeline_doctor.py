@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import CaptureError, FeedbackError
 from bikeped.pipeline import doctor
 from bikeped.pipeline.doctor import Check, Finding, checks, run_checks

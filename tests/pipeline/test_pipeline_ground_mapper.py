@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import GeometryError
 from bikeped.pipeline.track_and_decide import GroundMapper
 from bikeped.types import Detections, Kind

@@ -12,8 +12,8 @@ import jsonschema
 import numpy as np
 from pipeline_fakes import PATIENCE_S, FakeDetector, seen
 
-from bikeped.capture import FrameSource
-from bikeped.config import load_config
+from bikeped.capture.base import FrameSource
+from bikeped.config.load import load_config
 from bikeped.pipeline.replay import ReplayFiles, replay
 from bikeped.types import Frame, Kind
 

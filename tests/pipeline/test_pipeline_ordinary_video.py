@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from shared_inputs import CLIP, MODEL, missing
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.pipeline.replay import ReplayFiles, replay
 from bikeped.telemetry.builders import decision_digest
 

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pipeline_fakes import PATIENCE_S, Clock, FakeDetector
 
-from bikeped.capture import FrameGrabber, open_source
-from bikeped.config import CameraConfig
+from bikeped.capture import open_source
+from bikeped.capture.frame_grabber import FrameGrabber
+from bikeped.config.schema import CameraConfig
 from bikeped.errors import CaptureError
 from bikeped.pipeline.detection_scheduler import DetectionStage
 from bikeped.pipeline.feed import LiveFeed, RecordedFeed

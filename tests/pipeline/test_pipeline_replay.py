@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from pipeline_fakes import FakeDetector, seen
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError, CaptureError, GeometryError, TelemetryError
 from bikeped.pipeline.replay import ReplayFiles, replay
 from bikeped.telemetry.builders import decision_digest, decision_view, parse_event

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.pipeline.track_and_decide import TrackAndDecide
 from bikeped.types import Detections, GroundPoints, Kind, State
 

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from bikeped.config import framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import load_config
 
 ROOT = Path(__file__).parents[2]
 HEIGHT_M, PITCH_DEG = 4.21, -7.3

@@ -14,7 +14,8 @@ import pytest
 from aiohttp.test_utils import TestClient, TestServer
 from web_fakes import LOCKED, OPEN, Scene, web_context
 
-from bikeped.config import framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import load_config
 from bikeped.geometry.alignment import Alignment
 from bikeped.types import Frame
 from bikeped.web.align import add_align

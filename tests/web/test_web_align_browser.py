@@ -14,7 +14,7 @@ from align_scene import HEIGHT_M, ORANGE, PITCH_DEG, Scene, draw_scene
 from playwright.sync_api import Page, expect
 from web_fakes import OPEN, PHONE
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.web.align import add_align
 from bikeped.web.server import make_application
 

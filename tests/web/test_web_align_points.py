@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from bikeped.config import default_config_path, framing, ground_camera, load_config
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import default_config_path, load_config
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.web.align_points import (
     Between,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.web.align_save import ChangedError, file_hash, lines, save, why_not
 

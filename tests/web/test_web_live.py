@@ -16,7 +16,7 @@ import simplejpeg
 from aiohttp import web
 from web_fakes import OPEN, SIGNALS, Scene, small, web_context
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.replay import replay
 from bikeped.telemetry.http_server import HttpServer

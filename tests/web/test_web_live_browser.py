@@ -17,7 +17,7 @@ from drawn_detectors import clip_detector
 from playwright.sync_api import Page, expect
 from web_fakes import DESKTOP, OPEN, PHONE, SIGNALS, Scene, small, web_context
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario

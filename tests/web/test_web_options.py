@@ -8,7 +8,7 @@ import pytest
 
 from bikeped.cli.common import web_overrides
 from bikeped.cli.main import main
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError
 
 

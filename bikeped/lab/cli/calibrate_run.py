@@ -17,7 +17,8 @@ from rich.table import Table
 
 from bikeped.capture import open_source
 from bikeped.cli.common import progress_bar, text_table, write_json
-from bikeped.config import LoadedConfig, framing, load_config
+from bikeped.config.build import framing
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 from bikeped.geometry.lens import canonical_projection

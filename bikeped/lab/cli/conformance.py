@@ -8,7 +8,7 @@ import click
 from rich.markup import escape
 
 from bikeped.cli.common import LazyGroup, progress_bar
-from bikeped.config import load_decision
+from bikeped.config.load import load_decision
 from bikeped.errors import BikepedError, require
 from bikeped.files import write_whole
 from bikeped.lab.cli.conformance_shared import (

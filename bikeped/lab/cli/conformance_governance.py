@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from bikeped.cli.common import progress_bar, text_table
-from bikeped.config import load_decision
+from bikeped.config.load import load_decision
 from bikeped.errors import BikepedError, ConfigError, require
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.cli.conformance_shared import SuiteRun, suite_options
@@ -20,7 +20,7 @@ from bikeped.lab.cli.conformance_shared import SuiteRun, suite_options
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from bikeped.config import DecisionConfig
+    from bikeped.config.schema import DecisionConfig
     from bikeped.lab.governance.gates import Gate
 
 candidate_argument = click.argument("candidate", type=click.Path(path_type=Path))

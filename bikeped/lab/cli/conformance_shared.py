@@ -20,7 +20,8 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import guarded
-from bikeped.config import DecisionConfig, LoadedConfig, load_config
+from bikeped.config.load import LoadedConfig, load_config
+from bikeped.config.schema import DecisionConfig
 from bikeped.cores import cores
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.cli.model import report

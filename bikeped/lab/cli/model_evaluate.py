@@ -8,7 +8,7 @@ import click
 
 from bikeped.cli.common import FiniteRange, config_options, json_option, progress_bar
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError, require
 from bikeped.lab.cli.conformance_shared import rich_table
 from bikeped.lab.cli.model import PATH, data_argument, data_files, images_option, report

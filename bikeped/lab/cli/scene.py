@@ -12,7 +12,7 @@ import click
 
 from bikeped.cli.common import FiniteRange, config_options, json_option, progress_bar
 from bikeped.cli.guard import check_outputs, guarded, written_paths
-from bikeped.config import LoadedConfig, load_config
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.errors import BikepedError, GeometryError, ScenarioError
 from bikeped.files import write_whole
 from bikeped.lab.cli.model import picture_size, report

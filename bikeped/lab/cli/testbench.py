@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from bikeped.cli.common import config_options, console, json_option, progress_bar, write_json
 from bikeped.cli.guard import guarded
-from bikeped.config import LoadedConfig, load_config
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.errors import BikepedError
 from bikeped.files import write_whole
 from bikeped.lab.cli.conformance_governance import print_comparison

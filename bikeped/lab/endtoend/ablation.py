@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.config.load import LoadedConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.lab.endtoend.measures import MIN_VISIBLE, match_detections
 from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.rendering import DrawnObject

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.geometry.boxes import Boxes, iou_matrix
 from bikeped.lab.endtoend.run import EndToEndRun
 from bikeped.lab.rendering import DrawnObject

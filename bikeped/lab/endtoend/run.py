@@ -11,7 +11,7 @@ import numpy.typing as npt
 import simplejpeg
 
 from bikeped.capture.base import FrameSource
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.rendering import Conditions, DrawnObject, ScenePainter, scene_camera

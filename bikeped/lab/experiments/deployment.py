@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.config import DecisionConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.lens import Lens
 from bikeped.lab.experiments.trials import (

@@ -14,7 +14,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.config.load import LoadedConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.decision.episodes import onsets
 from bikeped.errors import ScenarioError
 from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells

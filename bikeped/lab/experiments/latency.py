@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bikeped.config import DecisionConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.lab.experiments.deterministic import METRIC_COLUMNS
 from bikeped.lab.experiments.trials import (
     TRIALS,

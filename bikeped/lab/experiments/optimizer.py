@@ -15,7 +15,8 @@ import numpy as np
 import scipy
 from scipy.optimize import Bounds, differential_evolution
 
-from bikeped.config import DecisionConfig, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import ScenarioError
 from bikeped.lab.experiments.deterministic import METRIC_COLUMNS
 from bikeped.lab.process_pool import ProgressCallback, no_progress

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from bikeped import __version__
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.experiments import deployment, latency, optimizer

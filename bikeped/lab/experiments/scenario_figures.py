@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bikeped.config import DecisionConfig, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.schema import DecisionConfig
 from bikeped.decision.episodes import onsets, runs
 from bikeped.lab.plotting import (
     BLACK,

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.config import DecisionConfig, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.schema import DecisionConfig
 from bikeped.lab.plotting import to_floats
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
 from bikeped.lab.result_tables import ExperimentResult, ResultTable

@@ -16,8 +16,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bikeped.config import DecisionConfig, LoadedConfig, config_hash, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.load import LoadedConfig, config_hash
 from bikeped.config.provenance import decision_hash
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import BikepedError
 from bikeped.files import WholeFile
 from bikeped.lab.simulation.simulate import RuleInput, verdicts

@@ -17,8 +17,8 @@ from typing import Any
 import msgspec
 
 from bikeped import __version__
-from bikeped.config import DecisionConfig, LoadedConfig, config_hash, parse_config
 from bikeped.config.edit import replace_section
+from bikeped.config.load import LoadedConfig, config_hash, parse_config
 from bikeped.config.provenance import (
     DECIDING_CODE,
     MEASURING_CODE,
@@ -27,6 +27,7 @@ from bikeped.config.provenance import (
     provenance_path,
     setting_hashes,
 )
+from bikeped.config.schema import DecisionConfig
 from bikeped.config.strict_yaml import read_text
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.files import write_like

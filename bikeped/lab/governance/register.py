@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bikeped.config import DecisionConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.lab.governance.gates import BUDGET_ABOVE_S, SENSITIVITY_MIN, SPECIFICITY_MIN
 from bikeped.lab.result_tables import CellValue, ResultTable
 from bikeped.lab.simulation.suite import Suite

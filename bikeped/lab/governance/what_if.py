@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.config import DecisionConfig
 from bikeped.config.provenance import decision_hash
+from bikeped.config.schema import DecisionConfig
 from bikeped.decision.episodes import runs
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.lab.governance.gates import all_hold, check_gates

@@ -13,7 +13,8 @@ from functools import cached_property, lru_cache
 import cv2
 import numpy as np
 
-from bikeped.config import LoadedConfig, framing, ground_camera
+from bikeped.config.build import framing, ground_camera
+from bikeped.config.load import LoadedConfig
 from bikeped.errors import GeometryError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing

@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped import __version__
-from bikeped.config import DecisionConfig, LoadedConfig, ground_camera, rule_settings
+from bikeped.config.build import ground_camera, rule_settings
+from bikeped.config.load import LoadedConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.scenarios.scenario import Scenario, dump_scenario
 from bikeped.lab.simulation.camera_pose import CameraPose

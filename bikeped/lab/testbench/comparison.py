@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from bikeped import __version__
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
 from bikeped.decision.episodes import runs
 from bikeped.lab.governance.gates import check_gates

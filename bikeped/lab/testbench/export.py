@@ -19,8 +19,9 @@ import msgspec
 from markupsafe import Markup
 
 from bikeped import __version__
-from bikeped.config import DecisionConfig, LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, MEASURING_CODE, code_hash
+from bikeped.config.schema import DecisionConfig
 from bikeped.lab.experiments.deterministic import compare_table, run_table
 from bikeped.lab.experiments.report import (
     definitions_html,

@@ -20,10 +20,10 @@ from aiohttp import web
 from msgspec import Meta
 
 from bikeped import __version__
-from bikeped.config import DecisionConfig, LoadedConfig
 from bikeped.config.docs import key_descriptions
+from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, code_hash
-from bikeped.config.schema import Section
+from bikeped.config.schema import DecisionConfig, Section
 from bikeped.lab.experiments.optimizer import BOUNDS
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS

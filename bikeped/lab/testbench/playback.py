@@ -12,7 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bikeped.config import DecisionConfig, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.schema import DecisionConfig
 from bikeped.decision.decider import explain, pair_metrics, select_pair
 from bikeped.decision.episodes import onsets
 from bikeped.decision.rules import PairChecks, is_remembered

@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.errors import BikepedError
 from bikeped.lab.experiments.deployment import fuse_cameras
 from bikeped.lab.experiments.trials import (

@@ -17,8 +17,9 @@ from urllib.parse import parse_qsl, quote, urlsplit
 import msgspec
 from msgspec import Meta
 
-from bikeped.config import DecisionConfig, LoadedConfig, ground_camera
-from bikeped.config.schema import Section
+from bikeped.config.build import ground_camera
+from bikeped.config.load import LoadedConfig
+from bikeped.config.schema import DecisionConfig, Section
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.experiments.latency import delay_frames

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.errors import DataSetError
 from bikeped.files import make_folder
 from bikeped.lab.process_pool import worker_pool

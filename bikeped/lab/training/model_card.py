@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from bikeped.capture.jpeg import JpegDecoder
-from bikeped.config import LoadedConfig
+from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import Detector, load_detector
 from bikeped.geometry.boxes import iou_matrix

@@ -15,7 +15,7 @@ from aiohttp.test_utils import TestClient, TestServer
 from board_render import draw_picture
 from synthetic_boards import BoardPose, DrawnCamera, draw_views, spread_poses
 
-from bikeped.capture import FrameSource
+from bikeped.capture.base import FrameSource
 from bikeped.config.schema import WebConfig
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.geometry.lens import Lens

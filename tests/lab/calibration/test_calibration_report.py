@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from calibration_scenes import boards, camera, found
 
-from bikeped.config import ground_camera, load_config
+from bikeped.config.build import ground_camera
+from bikeped.config.load import load_config
 from bikeped.errors import CalibrationError
 from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import Lens

@@ -21,7 +21,8 @@ from shared_inputs import SHARED, missing
 from synthetic_boards import BoardPose, DrawnCamera, spread_poses, turn
 
 from bikeped.cli.main import main
-from bikeped.config import ground_camera, load_config
+from bikeped.config.build import ground_camera
+from bikeped.config.load import load_config
 from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView
 from bikeped.lab.calibration.solver.lens_model import CornerObservations

@@ -13,7 +13,7 @@ import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
 from bikeped.cli.main import main
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.testbench.comparison import InvocationOptions
 from bikeped.lab.testbench.pages import add_testbench

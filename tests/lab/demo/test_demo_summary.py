@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from drawn_detectors import boxes
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.lab.demo.summary import bundled_scenario, format_summary, summarise
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import load_scenario

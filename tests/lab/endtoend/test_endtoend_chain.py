@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drawn_detectors import OracleDetector
 
-from bikeped.config import LoadedConfig, load_config
+from bikeped.config.load import LoadedConfig, load_config
 from bikeped.lab.endtoend.ablation import run_ablation, states_from_boxes
 from bikeped.lab.endtoend.measures import (
     MIN_VISIBLE,

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError
 from bikeped.lab.experiments import reproduce as rep
 from bikeped.lab.result_tables import ExperimentResult

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from bikeped.config import load_config, parse_decision
+from bikeped.config.load import load_config, parse_decision
 from bikeped.errors import ScenarioError
 from bikeped.lab.experiments import deployment as dep
 from bikeped.lab.experiments import deterministic as ex

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from detection_losses import misses
 
-from bikeped.config import load_config, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError
 from bikeped.lab.experiments import trials
 from bikeped.lab.experiments import trials as mc

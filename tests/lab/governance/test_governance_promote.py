@@ -8,8 +8,9 @@ import stat
 import click
 import pytest
 
-from bikeped.config import DecisionConfig, load_config, parse_decision
+from bikeped.config.load import load_config, parse_decision
 from bikeped.config.provenance import check_provenance, decision_hash
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.lab.cli.conformance import command as conformance
 from bikeped.lab.governance import gates as promoting

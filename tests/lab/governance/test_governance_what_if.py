@@ -6,7 +6,8 @@ import shlex
 import numpy as np
 import pytest
 
-from bikeped.config import DecisionConfig, load_config
+from bikeped.config.load import load_config
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import BikepedError
 from bikeped.lab.cli.conformance import command as conformance
 from bikeped.lab.governance import register

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.capture import VideoSource
-from bikeped.config import load_config
+from bikeped.capture.recordings import VideoSource
+from bikeped.config.load import load_config
 from bikeped.errors import BikepedError, CaptureError
 from bikeped.lab.rendering import (
     Conditions,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.rendering import Conditions, DrawnObject, SceneCamera, ScenePainter, scene_camera
 from bikeped.lab.rendering.conditions import lighting

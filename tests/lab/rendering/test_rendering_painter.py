@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import GeometryError, ScenarioError
 from bikeped.geometry.lens import Lens
 from bikeped.lab.rendering import Conditions, SceneCamera, ScenePainter, scene_camera

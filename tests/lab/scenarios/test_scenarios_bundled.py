@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bikeped.config import rule_settings
+from bikeped.config.build import rule_settings
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, bundled_folder, load_scenarios
 from bikeped.lab.simulation.perception import SIMULATION_POSE
 from bikeped.lab.simulation.suite import CONFIGURATIONS, compare

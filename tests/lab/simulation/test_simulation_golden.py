@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bikeped.config import load_config, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.load import load_config
 from bikeped.decision.decider import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.simulate import FPS, SIMULATION_TRACKER

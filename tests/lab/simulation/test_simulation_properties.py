@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config import rule_settings
+from bikeped.config.build import rule_settings
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.perception import SIMULATION_POSE

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from detection_losses import misses
 
-from bikeped.config import rule_settings
+from bikeped.config.build import rule_settings
 from bikeped.decision.decider import Decider
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.perception import RecallModel, trial_generator

@@ -9,7 +9,8 @@ import pytest
 from aiohttp.test_utils import TestClient, TestServer
 from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 
-from bikeped.config import DecisionConfig, rule_settings
+from bikeped.config.build import rule_settings
+from bikeped.config.schema import DecisionConfig
 from bikeped.decision.decider import Decider
 from bikeped.lab.experiments.latency import sweep
 from bikeped.lab.experiments.trials import (
@@ -170,7 +171,8 @@ def test_a_second_camera_sees_what_the_first_cannot(work):
 
 
 def test_the_camera_is_hung_as_the_command_line_hangs_it(work):
-    from bikeped.config import ground_camera, load_config
+    from bikeped.config.build import ground_camera
+    from bikeped.config.load import load_config
 
     by_hand = load_config(
         overrides=("camera.height_m=5.5", "camera.pitch_deg=-30", "camera.fov_deg=150")

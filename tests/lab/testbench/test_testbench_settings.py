@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from testbench_fakes import BASE, MARKUP, OWN, bench, pages
 
-from bikeped.config import DecisionConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.lab.testbench.pages import JobQueue, ranges
 from bikeped.lab.testbench.settings import (

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 from web_fakes import OPEN
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.testbench.pages import add_testbench
 from bikeped.lab.testbench.settings import BenchSettings, settings_in_force

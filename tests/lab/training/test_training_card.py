@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.config.schema import DetectionConfig
 from bikeped.lab.rendering import DrawnObject, scene_camera
 from bikeped.lab.training.model_card import (

@@ -6,7 +6,7 @@ import hashlib
 
 import pytest
 
-from bikeped.config import load_config
+from bikeped.config.load import load_config
 from bikeped.errors import DataSetError
 from bikeped.lab.rendering.render_camera import DEFAULT_POSE
 from bikeped.lab.training.coco import read_coco, read_picture

@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bikeped.capture import VideoSource, read_size
+from bikeped.capture.jpeg import read_size
 from bikeped.capture.opencv import silence_opencv
-from bikeped.capture.recordings import IMAGE_SUFFIXES, JPEG_SUFFIXES, image_paths
+from bikeped.capture.recordings import IMAGE_SUFFIXES, JPEG_SUFFIXES, VideoSource, image_paths
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.types import Frame, ImageArray
 

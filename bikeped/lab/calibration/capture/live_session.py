@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from aiohttp import hdrs, web
 
-from bikeped.capture import FrameSource
+from bikeped.capture.base import FrameSource
 from bikeped.config.schema import WebConfig
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.files import make_folder, write_whole
