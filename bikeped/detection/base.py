@@ -60,10 +60,10 @@ class Detector(Protocol):
         """
 
 
-def sha256_of(path: Path) -> str:
+def sha256_of(path: Path, expected: str | None = None) -> str:
     """The file's SHA-256 in lower-case hexadecimal, read in chunks of 1 MiB.
 
-    Raises `DetectorError` where the file cannot be read.
+    Raises `DetectorError` where the file cannot be read or is not `expected`, `detection.sha256`.
     """
     digest = hashlib.sha256()
     try:
@@ -76,12 +76,7 @@ def sha256_of(path: Path) -> str:
         ) from None
     except OSError as error:
         raise DetectorError(f"{path}: cannot read the model file: {error.strerror}") from error
-    return digest.hexdigest()
-
-
-def verify_sha256(path: Path, expected: str | None) -> str:
-    """The file's hash; raises `DetectorError` where `detection.sha256` expects another."""
-    actual = sha256_of(path)
+    actual = digest.hexdigest()
     if expected is not None and expected.lower() != actual:
         raise DetectorError(
             f"{path}: SHA-256 is {actual} but detection.sha256 expects {expected.lower()}; "
@@ -110,12 +105,12 @@ def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None =
         from bikeped.detection.onnx_runtime import OnnxBackend, runs_on_cpu
 
         path = model_file(config.model, base_dir, on_cpu=runs_on_cpu(config.providers))
-        digest = verify_sha256(path, config.sha256)
+        digest = sha256_of(path, config.sha256)
         backend: Backend = OnnxBackend(path, config, digest, road)
     elif path.suffix.lower() == ".engine":
         from bikeped.detection.trt_engine import EngineBackend
 
-        digest = verify_sha256(path, config.sha256)
+        digest = sha256_of(path, config.sha256)
         backend = EngineBackend(path, config, road)
     else:
         raise DetectorError(

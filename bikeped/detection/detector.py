@@ -254,14 +254,15 @@ def _family(
     ask = "set detection.preprocess to yolox (0.1.1 and later) or yolox-legacy"
     if path.suffix.lower() != ".onnx":
         raise DetectorError(f"{path}: an engine does not show its preprocessing; {ask}")
-    from bikeped.detection.weights import first_layer  # protobuf is imported only here
+    from bikeped.detection.weights import first_gain, trained_on_bytes  # imports protobuf
 
-    first = first_layer(path)
-    if first is None or first.trained_on_bytes is None:
-        seen = "is not readable" if first is None else f"has gain {first.gain:.3g}"
+    gain = first_gain(path)
+    on_bytes = None if gain is None else trained_on_bytes(gain)
+    if on_bytes is None:
+        seen = "is not readable" if gain is None else f"has gain {gain:.3g}"
         raise DetectorError(
             f"{path}: the first convolution {seen}, so the preprocessing stays unknown; {ask}"
         )
-    if first.trained_on_bytes:
-        return "yolox", f"first convolution's gain {first.gain:.3g} is that of 0..255"
-    return "yolox-legacy", f"first convolution's gain {first.gain:.3g} is that of normalised input"
+    family: Family = "yolox" if on_bytes else "yolox-legacy"
+    input_range = "0..255" if on_bytes else "normalised input"
+    return family, f"first convolution's gain {gain:.3g} is that of {input_range}"

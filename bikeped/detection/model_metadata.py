@@ -12,7 +12,6 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -58,21 +57,6 @@ class ModelMetadata:
     ultralytics: bool = False  #: written by Ultralytics' exporter
 
 
-@dataclass(frozen=True)
-class InputSpec:
-    """The network's one input: [1, 3, height, width] of `dtype` (float32, float16 or uint8)."""
-
-    name: str
-    width: int
-    height: int
-    dtype: np.dtype[Any]
-
-    @property
-    def shape(self) -> tuple[int, int, int, int]:
-        """Of the input array."""
-        return (1, 3, self.height, self.width)
-
-
 def parse_metadata(entries: Mapping[str, object], source: str) -> ModelMetadata:
     """Parses a model's metadata map. Raises `DetectorError` for malformed class names.
 
@@ -100,12 +84,13 @@ def resolve_input(
     metadata: ModelMetadata,
     source: str,
     region: Region | None = None,
-) -> InputSpec:
-    """The input with every dynamic dimension filled in.
+) -> tuple[int, int, int, int]:
+    """The input's shape [1, 3, height, width] with every dynamic dimension filled in.
 
     `shape` is the runtime's: integers, and names, None or -1 where dynamic. A dynamic height or
     width is the metadata's `imgsz`, else 640; with `region` a dynamic height is at most what the
-    region needs at the input's width. Raises `DetectorError` for any other input.
+    region needs at the input's width. Raises `DetectorError` for any other shape
+    and for a `dtype` that is not float32, float16 or uint8.
     """
     if len(shape) != 4:
         raise DetectorError(
@@ -136,7 +121,7 @@ def resolve_input(
         raise DetectorError(
             f"{source}: input {name} is {kind}; export with float32, float16 or uint8 input"
         )
-    return InputSpec(name, width, height, kind)
+    return 1, 3, height, width
 
 
 def is_free(shape: Sequence[object]) -> bool:

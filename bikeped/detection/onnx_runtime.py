@@ -76,13 +76,13 @@ class OnnxBackend:
             )
         shape = inputs[0].shape
         self.region = choose_region(config, road, is_free(shape))
-        spec = resolve_input(inputs[0].name, shape, kind, self.metadata, self._source, self.region)
-        sides = zip(shape, spec.shape, strict=True)
-        names = {side: size for side, size in sides if isinstance(side, str) and side}
+        size = resolve_input(inputs[0].name, shape, kind, self.metadata, self._source, self.region)
+        sides = zip(shape, size, strict=True)
+        names = {name: side for name, side in sides if isinstance(name, str) and name}
         if names:  # a known size is planned better, and TensorRT needs no range of sizes
             self._session = self._open(config, providers, names)
-        self.buffer: npt.NDArray[Any] = np.zeros(spec.shape, spec.dtype)
-        self._feed = {spec.name: self.buffer}
+        self.buffer: npt.NDArray[Any] = np.zeros(size, kind)
+        self._feed = {inputs[0].name: self.buffer}
         self._names: list[str] = [output.name for output in self._session.get_outputs()]
 
     def _open(

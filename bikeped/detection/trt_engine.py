@@ -213,13 +213,13 @@ class EngineBackend:
         if min(shape, default=0) < 0 and self.metadata.image_size is None:
             # Dynamic and unnamed: what the engine was tuned for (of minimum, optimum, maximum).
             shape = [int(d) for d in self._engine.get_tensor_profile_shape(name, 0)[1]]
-        spec = resolve_input(name, shape, self._dtype(name), self.metadata, self._source)
-        if not self._context.set_input_shape(name, spec.shape):
+        dtype = self._dtype(name)
+        size = resolve_input(name, shape, dtype, self.metadata, self._source)
+        if not self._context.set_input_shape(name, size):
             raise DetectorError(
-                f"{self._source}: the engine refuses input {list(spec.shape)}; build it for this "
-                "shape"
+                f"{self._source}: the engine refuses input {list(size)}; build it for this shape"
             )
-        array = self._cuda.host(spec.shape, spec.dtype)
+        array = self._cuda.host(size, dtype)
         self._input_address = self._cuda.device(array.nbytes)
         self._address(name, self._input_address)
         return array

@@ -9,7 +9,6 @@ deviation, 255 * 0.225 = 57 times, than one on normalised input. The few fields 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from bikeped.errors import DetectorError
 _TYPES = {1: "<f4", 10: "<f2", 11: "<f8"}
 #: Operators that rearrange values and do not change them.
 _MOVES = frozenset({"Slice", "Concat", "Cast", "Identity", "Transpose", "Reshape", "SpaceToDepth"})
-#: A gain (see `FirstLayer`) between these decides nothing. YOLOX nano before 0.1.1 has 7.8; the
+#: A gain (see `first_gain`) between these decides nothing. YOLOX nano before 0.1.1 has 7.8; the
 #: same network written for 0..255 has 0.14.
 _LEGACY_ABOVE, _BYTES_BELOW = 1.0, 0.4
 #: Fields of onnx.proto's messages: name, number and type; `*` is repeated.
@@ -40,29 +39,19 @@ _FIELDS = {
 }
 
 
-@dataclass(frozen=True)
-class FirstLayer:
-    """The first convolution of a network, batch normalisation folded in.
+def trained_on_bytes(gain: float) -> bool | None:
+    """Whether the input is 0..255 (True), normalised (False), or unknown (None), by the gain."""
+    if gain > _LEGACY_ABOVE:
+        return False
+    return True if gain < _BYTES_BELOW else None
 
-    `gain` is the root mean square, over filters, of the norm of the filter's weights: the standard
+
+def first_gain(path: Path) -> float | None:
+    """The gain of an ONNX file's first convolution after the image, batch normalisation folded in.
+
+    It is the root mean square, over filters, of the norm of the filter's weights: the standard
     deviation of the output for unit noise. (Not the median: half of the filters may be nearly
     zero.) Trained on normalised input it is of the order of 1, on 0..255 about 57 times less.
-    """
-
-    name: str
-    gain: float
-
-    @property
-    def trained_on_bytes(self) -> bool | None:
-        """Whether the input is 0..255 (True), normalised (False), or unknown (None)."""
-        if self.gain > _LEGACY_ABOVE:
-            return False
-        return True if self.gain < _BYTES_BELOW else None
-
-
-def first_layer(path: Path) -> FirstLayer | None:
-    """The first convolution after the image input of an ONNX file.
-
     None where it cannot be read: arithmetic before it, quantised weights, weights in another file.
     Raises `DetectorError` where the file cannot be read or is not ONNX.
     """
@@ -78,7 +67,7 @@ def first_layer(path: Path) -> FirstLayer | None:
         raise DetectorError(f"{path}: cannot read the model file: {error.strerror}") from error
 
 
-def _first_convolution(graph: Any) -> FirstLayer | None:
+def _first_convolution(graph: Any) -> float | None:
     tensors = {tensor.name: tensor for tensor in graph.initializer}
     for node in graph.node:
         if node.op_type == "Constant" and node.output:
@@ -95,9 +84,8 @@ def _first_convolution(graph: Any) -> FirstLayer | None:
     return None
 
 
-def _gain(conv: Any, nodes: Any, tensors: dict[str, Any]) -> FirstLayer | None:
-    name = conv.input[1]
-    weights = _array(tensors.get(name))
+def _gain(conv: Any, nodes: Any, tensors: dict[str, Any]) -> float | None:
+    weights = _array(tensors.get(conv.input[1]))
     if weights is None or weights.ndim != 4 or weights.size == 0:
         return None
     gain = np.sqrt((weights.astype(np.float64) ** 2).sum(axis=(1, 2, 3)))
@@ -111,7 +99,7 @@ def _gain(conv: Any, nodes: Any, tensors: dict[str, Any]) -> FirstLayer | None:
             epsilon = next((a.f for a in node.attribute if a.name == "epsilon"), 1e-5)
             gain = gain * np.abs(scale) / np.sqrt(np.maximum(variance + epsilon, 1e-12))
     mean = float(np.sqrt((gain**2).mean()))
-    return FirstLayer(name, mean) if np.isfinite(mean) else None
+    return mean if np.isfinite(mean) else None
 
 
 def _array(tensor: Any) -> npt.NDArray[np.floating] | None:

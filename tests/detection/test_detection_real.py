@@ -16,8 +16,8 @@ from onnx import helper, numpy_helper
 from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection import load_detector
-from bikeped.detection.weights import first_layer
+from bikeped.detection.base import load_detector
+from bikeped.detection.weights import first_gain, trained_on_bytes
 from bikeped.types import Kind
 
 pytestmark = pytest.mark.skipif(bool(missing(MODEL)), reason=missing(MODEL))
@@ -134,8 +134,8 @@ def for_bytes(path):
 
 def test_the_same_network_written_for_bytes_is_told_and_answers_the_same(tmp_path, frames):
     path = for_bytes(tmp_path / "bytes.onnx")
-    assert first_layer(path).trained_on_bytes is True
-    assert first_layer(MODEL).trained_on_bytes is False
+    assert trained_on_bytes(first_gain(path)) is True
+    assert trained_on_bytes(first_gain(MODEL)) is False
     ours, theirs = detector(path, confidence=0.3), detector(confidence=0.3)
     assert ours.family == "yolox"
     a, b = (d.infer(frames[20], 768, 432).detections for d in (ours, theirs))

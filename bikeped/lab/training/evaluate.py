@@ -29,7 +29,7 @@ import numpy as np
 
 from bikeped import __version__
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection import load_detector
+from bikeped.detection.base import load_detector
 from bikeped.detection.detector import NetworkDetector
 from bikeped.detection.nms import non_max_suppression
 from bikeped.detection.output_layouts import Candidates
