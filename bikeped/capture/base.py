@@ -5,7 +5,10 @@ from __future__ import annotations
 import abc
 from typing import TypeVar
 
-from bikeped.types import Frame
+from bikeped.types import Frame, ImageArray
+
+#: An image as a source has it: JPEG, or RGB [height, width, 3] uint8.
+Image = bytes | ImageArray
 
 _Source = TypeVar("_Source", bound="FrameSource")
 
@@ -22,6 +25,7 @@ class FrameSource(abc.ABC):
     height: int
     fps: float  #: nominal frames per second
     live: bool  #: True: `captured_s` is on the monotonic clock, and frames come in real time
+    _number = 0  #: of the next frame
 
     @abc.abstractmethod
     def read(self) -> Frame | None:
@@ -39,3 +43,10 @@ class FrameSource(abc.ABC):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _frame(self, captured_s: float, image: Image) -> Frame:
+        """The next frame, of the source's size."""
+        jpeg, rgb = (image, None) if isinstance(image, bytes) else (None, image)
+        frame = Frame(self._number, captured_s, self.width, self.height, jpeg, rgb)
+        self._number += 1
+        return frame

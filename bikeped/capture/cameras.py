@@ -21,22 +21,20 @@ from pathlib import Path
 from urllib.parse import urlsplit, urlunsplit
 
 import cv2
-import numpy as np
 
-from bikeped.capture.base import FrameSource
-from bikeped.capture.jpeg import EOI, read_size
+from bikeped.capture.base import Image
+from bikeped.capture.jpeg import EOI
 from bikeped.capture.opencv import (
-    Capture,
-    FfmpegReader,
+    FfmpegSource,
     OpenCapture,
-    as_rgb,
+    OpenCvSource,
     fourcc_text,
     frame_size,
-    silence_opencv,
+    image_size,
     usable_fps,
 )
 from bikeped.errors import CaptureError
-from bikeped.types import Frame, ImageArray
+from bikeped.types import Frame
 
 _log = logging.getLogger(__name__)
 
@@ -46,11 +44,10 @@ MAX_STAMP_AGE_S = 2.0
 # OpenCV repeats its last buffer, without waiting, after some unplugs.
 MAX_REPEATING_S = 1.0
 REPEAT_PAUSE_S = 0.005
-OPEN_TIMEOUT_MS = 5000
-READ_TIMEOUT_MS = 5000
+TIMEOUT_MS = 5000
 
 
-class V4l2Source(FrameSource):
+class V4l2Source(OpenCvSource):
     """A V4L2 camera by device path or number. `captured_s` is on the monotonic clock.
 
     `fourcc` MJPG gives JPEG frames; any other format is converted to RGB by OpenCV. Raises
@@ -72,55 +69,59 @@ class V4l2Source(FrameSource):
         sleep: Callable[[float], None] = time.sleep,
         open_capture: OpenCapture = cv2.VideoCapture,
     ) -> None:
-        self.name = f"/dev/video{int(device)}" if device.isdecimal() else device
+        path = f"/dev/video{int(device)}" if device.isdecimal() else device
+        super().__init__(path, path, "is it still plugged in?", open_capture)
         if len(fourcc) != 4:
             raise CaptureError(f"camera.fourcc: {fourcc!r} must have four characters, e.g. MJPG")
         self.width, self.height = width, height
         self._clock, self._sleep = clock, sleep
         self._raw = fourcc in JPEG_FORMATS
-        self._number = 0
-        self._last: tuple[float, bytes | ImageArray] | None = None
+        self._last: tuple[Image, float] | None = None
         self._last_s = -math.inf
-        self._capture = self._open(open_capture)
+        self._open(cv2.CAP_V4L2)
         try:
             self.fps = self._set_up(fps, fourcc)
         except BaseException:
-            self._capture.release()
+            self.close()
             raise
 
     def read(self) -> Frame:
         repeating_since_s: float | None = None
         while True:
-            try:
-                ok, data = self._capture.read()
-            except cv2.error as error:
-                raise CaptureError(f"{self.name}: cannot be read ({error.err})") from error
-            if not ok or data is None or data.size == 0:
-                raise CaptureError(f"{self.name}: returned no image; is it still plugged in?")
-            stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
-            image = trim(data.tobytes()) if self._raw else np.asarray(data, np.uint8)
-            if not self._repeated(stamp_ms, image):
-                return self._frame(stamp_ms, image)
+            found = self._read()
+            if found is None:
+                raise CaptureError(f"{self.name}: returned no image; {self._remedy}")
+            image, stamp_s = found
+            if isinstance(image, bytes):
+                image = trim(image)
+            last, self._last = self._last, (image, stamp_s)
+            if last is None or last[1] != stamp_s or bytes(image) != bytes(last[0]):
+                break
             now_s = self._clock()
             if repeating_since_s is None:
                 repeating_since_s = now_s
             elif now_s - repeating_since_s > MAX_REPEATING_S:
-                raise CaptureError(f"{self.name}: repeats its last image; is it still plugged in?")
+                raise CaptureError(f"{self.name}: repeats its last image; {self._remedy}")
             self._sleep(REPEAT_PAUSE_S)
+        size = image_size(image) if self._number == 0 else None
+        if size is not None and size != (self.width, self.height):
+            raise CaptureError(
+                f"{self.name}: grants {self.width}x{self.height} but sends {size[0]}x{size[1]}; "
+                "set camera.width and camera.height to that"
+            )
+        now_s = self._clock()
+        # Not from the monotonic clock, or not increasing: use the arrival time.
+        if not (0.0 <= now_s - stamp_s <= MAX_STAMP_AGE_S and stamp_s > self._last_s):
+            stamp_s = now_s
+        self._last_s = stamp_s
+        return self._frame(stamp_s, image)
 
-    def close(self) -> None:
-        self._capture.release()
-
-    def _open(self, open_capture: OpenCapture) -> Capture:
-        try:
-            with silence_opencv():
-                capture = open_capture(self.name, cv2.CAP_V4L2)
-                opened = capture.isOpened()
-        except cv2.error as error:
-            raise CaptureError(f"{self.name}: cannot be opened ({error.err})") from error
-        if not opened:
-            raise CaptureError(f"{self.name}: {_why_not_opened(Path(self.name))}")
-        return capture
+    def _why_not_opened(self) -> str:
+        if not Path(self.name).exists():
+            return "no such camera; plug it in, or set camera.source (`v4l2-ctl --list-devices`)"
+        if not os.access(self.name, os.R_OK | os.W_OK):
+            return "no permission; add this user to group video"
+        return "cannot be opened; is it a camera, and is another program using it (`fuser -v`)?"
 
     def _set_up(self, fps: float, fourcc: str) -> float:
         """Sets format, size and rate, in this order; returns the granted rate."""
@@ -151,42 +152,6 @@ class V4l2Source(FrameSource):
             _log.warning("%s: grants %.3g frames per second, not %.3g", self.name, rate, fps)
         return rate
 
-    def _repeated(self, stamp_ms: float, image: bytes | ImageArray) -> bool:
-        """Whether this is the last buffer again: same time stamp and same bytes."""
-        last, self._last = self._last, (stamp_ms, image)
-        if last is None or last[0] != stamp_ms:
-            return False
-        return image == last[1] if isinstance(image, bytes) else np.array_equal(image, last[1])
-
-    def _frame(self, stamp_ms: float, image: bytes | ImageArray) -> Frame:
-        if self._number == 0:
-            self._check_size(image)
-        now_s = self._clock()
-        captured_s = stamp_ms / 1000.0
-        # Not from the monotonic clock, or not increasing: use the arrival time.
-        if not (0.0 <= now_s - captured_s <= MAX_STAMP_AGE_S and captured_s > self._last_s):
-            captured_s = now_s
-        self._last_s = captured_s
-        jpeg, rgb = (image, None) if isinstance(image, bytes) else (None, as_rgb(image))
-        frame = Frame(self._number, captured_s, self.width, self.height, jpeg, rgb)
-        self._number += 1
-        return frame
-
-    def _check_size(self, image: bytes | ImageArray) -> None:
-        """Checks that the images have the granted size."""
-        if isinstance(image, bytes):
-            try:
-                size = read_size(image)
-            except CaptureError:
-                return  # the decoder refuses a damaged image
-        else:
-            size = image.shape[1], image.shape[0]
-        if size != (self.width, self.height):
-            raise CaptureError(
-                f"{self.name}: grants {self.width}x{self.height} but sends {size[0]}x{size[1]}; "
-                "set camera.width and camera.height to that"
-            )
-
 
 def trim(data: bytes) -> bytes:
     """The JPEG without the driver's padding behind it.
@@ -197,15 +162,7 @@ def trim(data: bytes) -> bytes:
     return data if end < 0 else data[: end + len(EOI)]
 
 
-def _why_not_opened(path: Path) -> str:
-    if not path.exists():
-        return "no such camera; plug it in, or set camera.source (`v4l2-ctl --list-devices`)"
-    if not os.access(path, os.R_OK | os.W_OK):
-        return "no permission; add this user to group video"
-    return "cannot be opened; is it a camera, and is another program using it (`fuser -v`)?"
-
-
-class NetworkSource(FrameSource):
+class NetworkSource(FfmpegSource):
     """A live stream by its address. `fps` is assumed where the stream has no frame rate.
 
     A stream that ends, fails or sends nothing for 5 s raises CaptureError.
@@ -221,35 +178,19 @@ class NetworkSource(FrameSource):
         clock: Callable[[], float] = time.monotonic,
         open_capture: OpenCapture = cv2.VideoCapture,
     ) -> None:
-        self.name = without_password(address)
+        remedy = "is the camera on, and are address, user and password right?"
+        timeouts = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+        params = dict.fromkeys(timeouts, TIMEOUT_MS)
+        super().__init__(address, without_password(address), remedy, open_capture, params)
         self._clock = clock
-        self._reader = FfmpegReader(
-            address,
-            self.name,
-            remedy="is the camera on, and are address, user and password right?",
-            params={
-                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: OPEN_TIMEOUT_MS,
-                cv2.CAP_PROP_READ_TIMEOUT_MSEC: READ_TIMEOUT_MS,
-            },
-            open_capture=open_capture,
-        )
-        self._opened_s: float | None = clock()  # when the first frame, read by now, arrived
-        self.width, self.height = self._reader.width, self._reader.height
-        self.fps = self._reader.fps if usable_fps(self._reader.fps) else fps
-        self._number = 0
+        self._opened_s = clock()  # when the first frame, read by now, arrived
+        self.fps = self.fps if usable_fps(self.fps) else fps
 
     def read(self) -> Frame:
-        image = self._reader.read()
-        if image is None:
+        found = self._next()
+        if found is None:
             raise CaptureError(f"{self.name}: the stream ended; is the camera still on?")
-        arrived_s = self._clock() if self._opened_s is None else self._opened_s
-        self._opened_s = None
-        frame = Frame(self._number, arrived_s, self.width, self.height, image.jpeg, image.rgb)
-        self._number += 1
-        return frame
-
-    def close(self) -> None:
-        self._reader.close()
+        return self._frame(self._clock() if self._number else self._opened_s, found[0])
 
 
 def without_password(address: str) -> str:

@@ -23,9 +23,22 @@ SMALLEST_REDUCTION = 2
 JpegBytes = bytes | bytearray | memoryview
 
 
-def read_size(data: JpegBytes) -> tuple[int, int]:
-    """(width, height) in pixels from the header; CaptureError when there is none."""
-    return _header_size(data, 0, 0)
+def read_size(data: JpegBytes, min_width: int = 0, min_height: int = 0) -> tuple[int, int]:
+    """(width, height) in pixels of the image as decoded; CaptureError when it has no header.
+
+    `min_width` and `min_height`: as for `JpegDecoder.decode`, but both or none.
+    """
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(
+            data,
+            min_width=min_width,
+            min_height=min_height,
+            min_factor=SMALLEST_REDUCTION,
+            strict=True,
+        )
+    except (ValueError, RuntimeError) as error:
+        raise CaptureError(f"JPEG: no image header ({error})") from error
+    return int(width), int(height)
 
 
 class JpegDecoder:
@@ -52,7 +65,7 @@ class JpegDecoder:
         if min_width > 0 or min_height > 0:
             # libjpeg scales only when both are given.
             min_width, min_height = max(min_width, 1), max(min_height, 1)
-        width, height = _header_size(data, min_width, min_height)
+        width, height = read_size(data, min_width, min_height)
         if width * height > self._max_pixels:
             raise CaptureError(f"JPEG: {width}x{height} pixels are too many; is it damaged?")
         try:
@@ -78,17 +91,3 @@ class JpegDecoder:
         if self._buffers[self._turn].size < size:
             self._buffers[self._turn] = np.empty(size, np.uint8)
         return self._buffers[self._turn][:size]
-
-
-def _header_size(data: JpegBytes, min_width: int, min_height: int) -> tuple[int, int]:
-    try:
-        height, width, _, _ = simplejpeg.decode_jpeg_header(
-            data,
-            min_width=min_width,
-            min_height=min_height,
-            min_factor=SMALLEST_REDUCTION,
-            strict=True,
-        )
-    except (ValueError, RuntimeError) as error:
-        raise CaptureError(f"JPEG: no image header ({error})") from error
-    return int(width), int(height)

@@ -1,6 +1,6 @@
-"""OpenCV's VideoCapture as used here: opening, undecoded packets, colours.
+"""What the sources behind OpenCV's VideoCapture have in common: opening, reading, colours.
 
-`FfmpegReader` is common to recordings and network streams: Motion JPEG stays undecoded, everything
+`FfmpegSource` is common to recordings and network streams: Motion JPEG stays undecoded, everything
 else becomes RGB.
 """
 
@@ -10,12 +10,12 @@ import contextlib
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
+from bikeped.capture.base import FrameSource, Image
 from bikeped.capture.jpeg import SOI, read_size
 from bikeped.errors import CaptureError
 from bikeped.types import ImageArray
@@ -39,20 +39,21 @@ class Capture(Protocol):
 OpenCapture = Callable[..., Capture]
 
 
-@dataclass(frozen=True)
-class RawImage:
-    """One image as OpenCV returned it: `jpeg` or `rgb` is set, as in Frame."""
-
-    jpeg: bytes | None
-    rgb: ImageArray | None
-    media_s: float  #: the container's time stamp, seconds; not valid for all containers
-
-
 def as_rgb(image: ImageArray) -> ImageArray:
     """RGB [height, width, 3] of an OpenCV image (BGR or grey)."""
     grey = image.ndim == 2 or image.shape[2] == 1
     code = cv2.COLOR_GRAY2RGB if grey else cv2.COLOR_BGR2RGB
     return np.asarray(cv2.cvtColor(image, code), np.uint8)
+
+
+def image_size(image: Image) -> tuple[int, int] | None:
+    """(width, height) in pixels; None for a damaged JPEG, which the decoder refuses."""
+    if not isinstance(image, bytes):
+        return image.shape[1], image.shape[0]
+    try:
+        return read_size(image)
+    except CaptureError:
+        return None
 
 
 def fourcc_text(code: float) -> str:
@@ -91,76 +92,94 @@ def silence_opencv() -> Iterator[None]:
         logging.setLogLevel(level)
 
 
-class FfmpegReader:
-    """The images of one file or address, through OpenCV's FFmpeg backend.
+class OpenCvSource(FrameSource):
+    """A source behind cv2.VideoCapture.
+
+    `name` stands for the address in messages, which may hold a password, and `remedy` ends them.
+    """
+
+    _raw = False  #: whether images come as JPEG
+
+    def __init__(
+        self, address: str, name: str, remedy: str, open_capture: OpenCapture = cv2.VideoCapture
+    ) -> None:
+        self.name = name
+        self._address, self._remedy, self._open_capture = address, remedy, open_capture
+
+    def close(self) -> None:
+        self._capture.release()
+
+    def _open(self, *options: object) -> None:
+        with self._errors("opened"), silence_opencv():
+            self._capture = self._open_capture(self._address, *options)
+            opened = self._capture.isOpened()
+        if not opened:
+            raise CaptureError(f"{self.name}: {self._why_not_opened()}")
+
+    def _why_not_opened(self) -> str:
+        return f"cannot be opened; {self._remedy}"
+
+    def _read(self) -> tuple[Image, float] | None:
+        """The next image and its time stamp in seconds, or None at the end."""
+        with self._errors("read"):
+            ok, data = self._capture.read()
+        if not ok or data is None or data.size == 0:
+            return None
+        stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+        return data.tobytes() if self._raw else as_rgb(data), stamp_s
+
+    @contextlib.contextmanager
+    def _errors(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except cv2.error as error:
+            why = str(error.err).replace(self._address, self.name)
+            text = f"{self.name}: cannot be {what} ({why}); {self._remedy}"
+            raise CaptureError(text) from error
+
+
+class FfmpegSource(OpenCvSource):
+    """A file or address, through OpenCV's FFmpeg backend.
 
     The first image is read on opening: it shows that the source has images, and whether its packets
     are complete JPEGs of the stated size (interlaced ones hold two, of half the height). If not,
     the source is opened again and decoded by FFmpeg. Packets may lack the Huffman tables, as AVI
-    allows: libjpeg-turbo then uses the standard ones.
-
-    `label` names the source in messages and `remedy` ends them. Raises CaptureError.
+    allows: libjpeg-turbo then uses the standard ones. `fps` is what the source states, valid or
+    not. Raises CaptureError.
     """
 
     def __init__(
         self,
         address: str,
-        label: str,
-        *,
+        name: str,
         remedy: str,
+        open_capture: OpenCapture,
         params: Mapping[int, int] | None = None,
-        open_capture: OpenCapture = cv2.VideoCapture,
     ) -> None:
-        self._address, self._label, self._remedy = address, label, remedy
+        super().__init__(address, name, remedy, open_capture)
         # No hardware decoding: two runs over one recording must give the same bytes.
         options = {cv2.CAP_PROP_HW_ACCELERATION: cv2.VIDEO_ACCELERATION_NONE, **(params or {})}
-        self._params = [int(number) for option in options.items() for number in option]
-        self._open_capture = open_capture
-        self._capture = self._open()
-        self.raw = self._request_raw()  #: whether images come as JPEG
+        flat = [int(number) for option in options.items() for number in option]
+        self._open(cv2.CAP_FFMPEG, flat)
+        self._raw = self._request_raw()
         first = self._read()
-        if self.raw and not self._whole_jpeg(first):
-            self._capture.release()
-            self._capture = self._open()
-            self.raw = False
+        if self._raw and not self._is_whole_jpeg(first):
+            self.close()
+            self._open(cv2.CAP_FFMPEG, flat)
+            self._raw = False
             first = self._read()
         if first is None:
-            self._capture.release()
-            raise CaptureError(f"{label}: has no image that can be read; {remedy}")
-        self._first: RawImage | None = first
+            self.close()
+            raise CaptureError(f"{name}: has no image that can be read; {remedy}")
+        self._first: tuple[Image, float] | None = first
         self.fps = self._capture.get(cv2.CAP_PROP_FPS)
-        self.expected_frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        self.width, self.height = (
-            frame_size(self._capture) if first.rgb is None else first.rgb.shape[1::-1]
-        )
+        stated = frame_size(self._capture)
+        self.width, self.height = stated if self._raw else image_size(first[0]) or stated
 
-    def read(self) -> RawImage | None:
-        """The next image, or None at the end of a file or stream."""
-        if self._first is not None:
-            first, self._first = self._first, None
-            return first
-        return self._read()
-
-    def close(self) -> None:
-        """Closes the file or connection."""
-        self._first = None
-        self._capture.release()
-
-    def _open(self) -> Capture:
-        try:
-            with silence_opencv():
-                capture = self._open_capture(self._address, cv2.CAP_FFMPEG, self._params)
-                opened = capture.isOpened()
-        except cv2.error as error:
-            raise self._failure("opened", error) from error
-        if not opened:
-            raise CaptureError(f"{self._label}: cannot be opened; {self._remedy}")
-        return capture
-
-    def _failure(self, what: str, error: cv2.error) -> CaptureError:
-        # An address may hold a password, which must not appear in a message.
-        why = str(error.err).replace(self._address, self._label)
-        return CaptureError(f"{self._label}: cannot be {what} ({why}); {self._remedy}")
+    def _next(self) -> tuple[Image, float] | None:
+        """As `_read`, from the first image on."""
+        first, self._first = self._first, None
+        return first or self._read()
 
     def _request_raw(self) -> bool:
         # Only OpenCV's own decoding applies a rotation tag.
@@ -170,22 +189,7 @@ class FfmpegReader:
             return False
         return bool(self._capture.set(cv2.CAP_PROP_FORMAT, -1))
 
-    def _whole_jpeg(self, image: RawImage | None) -> bool:
-        if image is None or image.jpeg is None or not image.jpeg.startswith(SOI):
-            return False
-        try:
-            return read_size(image.jpeg) == frame_size(self._capture)
-        except CaptureError:
-            return False
-
-    def _read(self) -> RawImage | None:
-        try:
-            ok, data = self._capture.read()
-        except cv2.error as error:
-            raise self._failure("decoded", error) from error
-        if not ok or data is None:
-            return None
-        media_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-        if self.raw:
-            return RawImage(data.tobytes(), None, media_s)
-        return RawImage(None, as_rgb(data), media_s)
+    def _is_whole_jpeg(self, found: tuple[Image, float] | None) -> bool:
+        image = found[0] if found else b""
+        whole = isinstance(image, bytes) and image.startswith(SOI)
+        return whole and image_size(image) == frame_size(self._capture)

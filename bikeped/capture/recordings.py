@@ -18,11 +18,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bikeped.capture.base import FrameSource
-from bikeped.capture.jpeg import read_size
-from bikeped.capture.opencv import FfmpegReader, OpenCapture, as_rgb, silence_opencv, usable_fps
+from bikeped.capture.base import FrameSource, Image
+from bikeped.capture.opencv import (
+    FfmpegSource,
+    OpenCapture,
+    as_rgb,
+    image_size,
+    silence_opencv,
+    usable_fps,
+)
 from bikeped.errors import CaptureError
-from bikeped.types import Frame, ImageArray
+from bikeped.types import Frame
 
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 IMAGE_SUFFIXES = JPEG_SUFFIXES | {".png", ".bmp", ".tif", ".tiff", ".webp"}
@@ -53,26 +59,23 @@ class ImageSource(FrameSource):
             raise CaptureError(
                 f"{self.name}: holds no images ({', '.join(sorted(IMAGE_SUFFIXES))})"
             )
-        self._number = 0
-        self.width, self.height = _size(*_load(self._paths[0]), self._paths[0])
+        size = image_size(_load(self._paths[0]))
+        if size is None:
+            raise CaptureError(f"{self._paths[0]}: has no image header; remove it")
+        self.width, self.height = size
 
     def read(self) -> Frame | None:
         if self._number >= len(self._paths):
             return None
         path = self._paths[self._number]
-        jpeg, rgb = _load(path)
-        try:
-            width, height = _size(jpeg, rgb, path)
-        except CaptureError:  # the decoder refuses a damaged JPEG, as from a camera
-            width, height = self.width, self.height
+        image = _load(path)
+        width, height = image_size(image) or (self.width, self.height)
         if (width, height) != (self.width, self.height):
             raise CaptureError(
                 f"{path}: is {width}x{height} pixels, but the first image is "
                 f"{self.width}x{self.height}; use one size per folder"
             )
-        frame = Frame(self._number, self._number / self.fps, width, height, jpeg, rgb)
-        self._number += 1
-        return frame
+        return self._frame(self._number / self.fps, image)
 
     def close(self) -> None:
         self._number = len(self._paths)
@@ -92,13 +95,13 @@ def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(0, int(p), "") if p[:1].isdigit() and p.isascii() else (1, 0, p) for p in parts], name
 
 
-def _load(path: Path) -> tuple[bytes | None, ImageArray | None]:
+def _load(path: Path) -> Image:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror}") from error
     if path.suffix.lower() in JPEG_SUFFIXES:
-        return data, None
+        return data
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         with silence_opencv():
@@ -107,19 +110,10 @@ def _load(path: Path) -> tuple[bytes | None, ImageArray | None]:
         raise CaptureError(f"{path}: is not an image ({error.err}); remove it") from error
     if image is None:
         raise CaptureError(f"{path}: is not an image that can be decoded; remove it")
-    return None, as_rgb(np.asarray(image, np.uint8))
+    return as_rgb(np.asarray(image, np.uint8))
 
 
-def _size(jpeg: bytes | None, rgb: ImageArray | None, path: Path) -> tuple[int, int]:
-    if rgb is not None:
-        return rgb.shape[1], rgb.shape[0]
-    try:
-        return read_size(jpeg or b"")
-    except CaptureError as error:
-        raise CaptureError(f"{path}: {error}; remove it") from error
-
-
-class VideoSource(FrameSource):
+class VideoSource(FfmpegSource):
     """A video file. `captured_s` is media time in seconds, strictly increasing.
 
     It is the container's time stamp where that increases, else the previous frame's plus one frame
@@ -130,46 +124,34 @@ class VideoSource(FrameSource):
     live = False
 
     def __init__(self, path: Path | str, *, open_capture: OpenCapture = cv2.VideoCapture) -> None:
-        self.name = str(path)
+        if not Path(path).is_file():
+            raise CaptureError(f"{path}: no such file; set camera.source to a video")
         remedy = (
             "is it a complete video file? `ffprobe` says what is in it, and "
             "`ffmpeg -i IN -c copy OUT.mkv` repairs some"
         )
-        if not Path(path).is_file():
-            raise CaptureError(f"{self.name}: no such file; set camera.source to a video")
-        self._reader = FfmpegReader(self.name, self.name, remedy=remedy, open_capture=open_capture)
-        self.width, self.height = self._reader.width, self._reader.height
-        self.fps = self._reader.fps
-        self._number = 0
+        super().__init__(str(path), str(path), remedy, open_capture)
         self._last_s = -math.inf
         if not usable_fps(self.fps):
-            self._reader.close()
+            self.close()
             raise CaptureError(
                 f"{self.name}: has no frame rate (it says {self.fps:g}); "
                 "`ffmpeg -r 30 -i IN -c copy OUT.mkv` writes one"
             )
 
     def read(self) -> Frame | None:
-        image = self._reader.read()
-        if image is None:
-            self._report_end()
+        found = self._next()
+        if found is None:
+            expected = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            if self._number < COMPLETE_SHARE * expected:
+                text = "%s: ends after %d of %.0f frames; is the file truncated?"
+                _log.warning(text, self.name, self._number, expected)
             return None
-        captured_s = image.media_s
+        image, captured_s = found
         if not (math.isfinite(captured_s) and captured_s > self._last_s):
             captured_s = self._last_s + 1.0 / self.fps if self._number else 0.0
-        frame = Frame(self._number, captured_s, self.width, self.height, image.jpeg, image.rgb)
-        self._number += 1
         self._last_s = captured_s
-        return frame
-
-    def close(self) -> None:
-        self._reader.close()
-
-    def _report_end(self) -> None:
-        expected = self._reader.expected_frames
-        if self._number < COMPLETE_SHARE * expected:
-            text = "%s: ends after %d of %.0f frames; is the file truncated?"
-            _log.warning(text, self.name, self._number, expected)
+        return self._frame(captured_s, image)
 
 
 class PacedSource(FrameSource):
