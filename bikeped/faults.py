@@ -29,7 +29,8 @@ class Effect(enum.Enum):
     """What a fault does to the light."""
 
     FAULT = "FAULT"  #: the decision cannot be trusted: the light shows FAULT
-    NOTICE = "none"  #: reported only: the decision still holds
+    WITHHELD = "FAULT for IDLE and SAFE"  #: people may be missed: blue and green are not shown
+    NOTICE = "none"  #: reported only (degraded): the decision still holds
 
 
 class Severity(enum.IntEnum):
@@ -67,6 +68,8 @@ _stops = partial(FaultKind, effect=Effect.FAULT, severity=Severity.ERROR, clears
 _begins = partial(_stops, severity=Severity.INFO)
 #: Only a new process helps: the light shows FAULT and the service ends.
 _ends = partial(_stops, severity=Severity.CRITICAL, clears=Clears.RESTART, exit_status=EXIT_RESTART)
+#: The light shows FAULT in place of blue and green.
+_withholds = partial(_stops, effect=Effect.WITHHELD, clears=Clears.AT_ONCE)
 #: Reported, while the light goes on showing the decision.
 _notice = partial(FaultKind, effect=Effect.NOTICE, severity=Severity.ERROR, clears=Clears.AT_ONCE)
 _minor = partial(_notice, severity=Severity.WARNING)
@@ -85,6 +88,11 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _stops("detector.error", "detector", "The detector fails on every frame."),
         _ends("detector.hang", "detector", "Inference has not returned for camera.hang_after_s."),
         _ends("detector.failing", "detector", "Only failures for camera.hang_after_s."),
+        _withholds(
+            "detector.blind",
+            "detector",
+            "The model misses what it found in a check picture, or finds nothing while much moves.",
+        ),
         _begins("service.starting", "service", "The model loads, or the first frames are due."),
         _begins("service.recovering", "service", "A fault is over; good frames are counted."),
         _stops(
@@ -166,8 +174,9 @@ _INTRO = """\
 
 What can be wrong, and what each fault does. The codes stand in `fault_codes` of the
 [health message](messages/README.md), beside the lines for people in `faults`. A fault whose light
-is FAULT makes the light blink orange, never blue or green; one with an exit status also ends the
-process, so that systemd starts a fresh one.
+is FAULT makes the light blink orange, never blue or green; where it says "for IDLE and SAFE" the
+light blinks orange in place of blue and green, and WARNING and ALERT show as decided; one with an
+exit status also ends the process, so that systemd starts a fresh one.
 
 """
 

@@ -23,6 +23,8 @@ The machine counts good frames: new decisions without a fault, in a row. It star
 * ALERT is held for `hold_alert_s`, so that a single frame of it is visible. The hold outlives a
   fault that begins meanwhile, but a fault does not renew it: red ends with the hold, then FAULT.
 * Blue, green and steady orange need the full count: a light never shows them before frames came.
+* A fault that only withholds (people may be missed) shows FAULT where blue or green would show; it
+  leaves the count, WARNING and ALERT alone.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bikeped.config.schema import FeedbackConfig
-from bikeped.faults import Fault
+from bikeped.faults import Effect, Fault
 from bikeped.types import Colour, Signal, Sound, State
 
 #: The fault shown before the first `recover_frames` good frames.
@@ -89,15 +91,16 @@ class SignalLogic:
         """The signal at `now_s`, in seconds of one monotonic clock.
 
         `decided` is the state of a new frame, None on a tick of the clock or when the decision
-        cannot be trusted. `faults` are those present now whose effect on the light is FAULT. The
-        chime is in the one signal in which SAFE begins.
+        cannot be trusted. `faults` are those present now whose effect on the light is FAULT or
+        WITHHELD. The chime is in the one signal in which SAFE begins.
         """
+        stopping = tuple(fault for fault in faults if fault.kind.effect is Effect.FAULT)
         if decided is State.ALERT:
             self._alert_s = now_s
-        if faults:
+        if stopping:
             self._good_frames = 0
             self._recovering_from = tuple(
-                Fault("recovering", "service.recovering", str(fault)) for fault in faults
+                Fault("recovering", "service.recovering", str(fault)) for fault in stopping
             )
         elif decided is not None:
             self._decided = decided
@@ -109,10 +112,12 @@ class SignalLogic:
             signal = Signal("ALERT", Colour.RED, self.blink_hz, Sound.BELL, faults)
         elif trusted is None:
             signal = fault_signal(faults or self._recovering_from, self.fault_blink_hz)
+        elif faults and trusted is not State.WARNING:
+            signal = fault_signal(faults, self.fault_blink_hz)
         else:
             begins = trusted is State.SAFE and self._shown != "SAFE"
             sound = Sound.CHIME if begins else Sound.NONE
-            signal = Signal(trusted.name, _STEADY[trusted], sound=sound)
+            signal = Signal(trusted.name, _STEADY[trusted], sound=sound, faults=faults)
         self._shown = signal.name
         return signal
 

@@ -17,6 +17,7 @@ from bikeped.types import Colour, Signal, Sound, State
 
 FRAME_S = 1 / 30
 CAMERA = (Fault("camera", "camera.no_frame", "no frame for more than 0.5 s"),)
+BLIND = (Fault("detector", "detector.blind", "the check picture's bicycle is not found"),)
 
 
 def recovered(**timings: float) -> tuple[SignalLogic, float]:
@@ -114,6 +115,20 @@ def test_the_state_before_a_fault_is_forgotten() -> None:
     assert logic.next_signal(now_s + 0.2, None).name == "FAULT"
 
 
+def test_a_withheld_decision_shows_fault_only_for_blue_and_green() -> None:
+    logic, now_s = recovered()
+    shown = [logic.next_signal(now_s + i, state, BLIND) for i, state in enumerate(State)]
+    assert {state.name: signal.name for state, signal in zip(State, shown, strict=True)} == {
+        "IDLE": "FAULT",
+        "SAFE": "FAULT",
+        "WARNING": "WARNING",
+        "ALERT": "ALERT",
+    }
+    assert all(signal.faults == BLIND for signal in shown)
+    # It costs no good frames: green is back with the first frame after it.
+    assert logic.next_signal(now_s + 9, State.SAFE).name == "SAFE"
+
+
 def test_a_held_alert_outlives_a_fault_only_by_its_hold() -> None:
     logic, now_s = recovered(hold_alert_s=1.0)
     logic.next_signal(now_s, State.ALERT)
@@ -176,26 +191,27 @@ class Oracle:
 
     def __init__(self, recover_frames: int, hold_s: float) -> None:
         self.recover_frames, self.hold_s = recover_frames, hold_s
-        self.calls: list[tuple[float, State | None, bool]] = []
-        self.before = "FAULT"
+        self.calls: list[tuple[float, State | None, tuple[Fault, ...]]] = []
 
     def name(self) -> str:
-        now_s, _, faulty = self.calls[-1]
+        now_s, _, faults = self.calls[-1]
         alerts = [t for t, state, _ in self.calls if state is State.ALERT]
         if alerts and (now_s == alerts[-1] or now_s - alerts[-1] < self.hold_s):
             return "ALERT"
-        since = max((i + 1 for i, call in enumerate(self.calls) if call[2]), default=0)
-        good = [state for _, state, _ in self.calls[since:] if state is not None]
-        if faulty or len(good) < self.recover_frames:
+        stopped = [i + 1 for i, call in enumerate(self.calls) if CAMERA[0] in call[2]]
+        good = [state for _, state, _ in self.calls[max(stopped, default=0) :] if state is not None]
+        if CAMERA[0] in faults or len(good) < self.recover_frames:
             return "FAULT"
-        return good[-1].name
+        withheld = faults and good[-1] in (State.IDLE, State.SAFE)
+        return "FAULT" if withheld else good[-1].name
 
 
 def test_all_states_and_inputs() -> None:
-    """Every input in every state that four calls reach: four states and a tick, with a fault and
-    without, within the hold of an ALERT and after it."""
-    recover, hold_s, reached = 2, 1.0, set()
-    inputs = list(itertools.product((None, *State), (False, True), (0.4, 1.5)))
+    """Every input in every state of the machine: four states and a tick; no fault, one that stops,
+    one that withholds, both; within the hold of an ALERT and after it."""
+    recover, hold_s, reached, walked = 2, 1.0, set(), set()
+    causes = ((), CAMERA, BLIND, CAMERA + BLIND)
+    inputs = list(itertools.product((None, *State), causes, (0.4, 1.5)))
     colours = {
         "IDLE": Colour.BLUE,
         "SAFE": Colour.GREEN,
@@ -204,32 +220,38 @@ def test_all_states_and_inputs() -> None:
         "FAULT": Colour.ORANGE,
     }
 
-    def walk(logic: SignalLogic, calls: list[tuple[float, State | None, bool]], shown: str) -> None:
-        for state, faulty, pause_s in inputs:
+    def walk(
+        logic: SignalLogic, calls: list[tuple[float, State | None, tuple[Fault, ...]]], shown: str
+    ) -> None:
+        for state, faults, pause_s in inputs:
             oracle = Oracle(recover, hold_s)
             now_s = (calls[-1][0] if calls else 0.0) + pause_s
-            oracle.calls = [*calls, (now_s, state, faulty)]
+            oracle.calls = [*calls, (now_s, state, faults)]
             after = copy.copy(logic)
-            signal = after.next_signal(now_s, state, CAMERA if faulty else ())
+            signal = after.next_signal(now_s, state, faults)
             assert signal.name == oracle.name(), oracle.calls
             assert signal.colour is colours[signal.name]
             assert (signal.blink_hz > 0) == (signal.name in ("ALERT", "FAULT"))
-            assert not (faulty and signal.colour in (Colour.BLUE, Colour.GREEN))
+            assert not (faults and signal.colour in (Colour.BLUE, Colour.GREEN))
             chimes = signal.name == "SAFE" and shown != "SAFE"
             bell = signal.name == "ALERT"
             assert signal.sound is (Sound.CHIME if chimes else Sound.BELL if bell else Sound.NONE)
-            assert bool(signal.faults) == (signal.name == "FAULT" or faulty)
-            if faulty:
-                assert signal.faults == CAMERA
-            reached.add((shown, state, faulty, signal.name))
-            if len(calls) < 3:
+            assert bool(signal.faults) == (signal.name == "FAULT" or bool(faults))
+            if faults:
+                assert signal.faults == faults
+            reached.add((shown, state, faults, signal.name))
+            alert_s = now_s - (after._alert_s or -hold_s)
+            kept = (after._good_frames, after._decided, after._recovering_from, after._shown)
+            machine = (*kept, round(min(alert_s, hold_s), 3))
+            if machine not in walked:
+                walked.add(machine)
                 walk(after, oracle.calls, signal.name)
 
     walk(SignalLogic(recover_frames=recover, hold_alert_s=hold_s), [], "FAULT")
     shown_before = {before for before, _, _, _ in reached}
     assert shown_before == set(colours)
     # From every shown state, every input was tried.
-    assert len({(b, s, f) for b, s, f, _ in reached}) == len(colours) * 5 * 2
+    assert len({(b, s, f) for b, s, f, _ in reached}) == len(colours) * 5 * len(causes)
 
 
 def test_every_pair_of_states_follows_at_once_outside_alert() -> None:
