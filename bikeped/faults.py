@@ -2,22 +2,18 @@
 
 A `Fault` is made where its cause is known. What follows from it (what the light shows, which
 component's health it belongs to, how it clears, whether the process ends) stands once, in
-`FAULT_KINDS`. A new fault is one line of that table and one place that makes it. `python -m
-bikeped.faults docs/faults-reference.md` writes the page from the table.
+`FAULT_KINDS`. A new fault is one line of that table and one place that makes it;
+docs/faults-reference.md is made from the table.
 """
 
 from __future__ import annotations
 
 import enum
 import logging
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Literal
-
-from bikeped.files import write_whole
 
 #: Exit status for "start a fresh process" (EX_TEMPFAIL of sysexits.h); systemd restarts on it.
 EXIT_RESTART = 75
@@ -145,40 +141,3 @@ class Fault:
 def fault_texts(faults: Iterable[Fault]) -> tuple[str, ...]:
     """The lines for people, in order."""
     return tuple(map(str, faults))
-
-
-def markdown() -> str:
-    """The reference page: one row a fault."""
-    rows = [
-        (
-            f"`{kind.code}`",
-            kind.meaning,
-            kind.effect.value,
-            kind.component,
-            kind.severity.name.lower(),
-            kind.clears.value,
-            "" if kind.exit_status is None else str(kind.exit_status),
-        )
-        for kind in FAULT_KINDS.values()
-    ]
-    head = ("code", "meaning", "light", "component", "severity", "clears", "exit status")
-    lines = [f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows)]
-    return _INTRO + "\n".join(lines) + "\n"
-
-
-_INTRO = """\
-# Faults
-
-<!-- Made by `python -m bikeped.faults docs/faults-reference.md` from the table in
-     bikeped/faults.py; change it there. -->
-
-What can be wrong, and what each fault does. The codes stand in `fault_codes` of the
-[health message](messages/README.md), beside the lines for people in `faults`. A fault whose light
-is FAULT makes the light blink orange, never blue or green; where it says "for IDLE and SAFE" the
-light blinks orange in place of blue and green, and WARNING and ALERT show as decided; one with an
-exit status also ends the process, so that systemd starts a fresh one.
-
-"""
-
-if __name__ == "__main__":
-    write_whole(Path(sys.argv[1]), markdown())

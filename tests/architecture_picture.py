@@ -1,6 +1,6 @@
 """Draws docs/architecture.svg: rooms by layer, and the imports between them, read from the code.
 
-`python tests/architecture_picture.py` writes it; `test_architecture.py` holds that it is current.
+`reference_pages.py` writes it.
 Layers come from the import-linter contracts in pyproject.toml, arrows from the import graph,
 sentences from the rooms' docstrings.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import re
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,8 +134,3 @@ def draw() -> str:
     return environment.from_string(_TEMPLATE).render(
         width=_WIDTH, height=y, box=_BOX, floors=floors, rooms=rooms, arrows=arrows
     )
-
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT))
-    PICTURE.write_text(draw() + "\n", encoding="utf-8")

@@ -80,6 +80,6 @@ def show(config_path: Path | None, overrides: tuple[str, ...], json_path: str | 
 @guarded
 def schema(config_path: Path | None, overrides: tuple[str, ...], json_path: str | None) -> None:
     """Print the JSON Schema of the configuration."""
-    from bikeped.config.docs import json_schema
+    from bikeped.config.json_schema import json_schema
 
     write_json(json_schema(), json_path or "-")

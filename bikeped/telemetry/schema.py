@@ -1,4 +1,4 @@
-"""Types of every MQTT payload and event line; `json_schema` publishes them as JSON Schema.
+"""Types of every MQTT payload and event line; docs/messages has their JSON Schemas.
 
 Other programs rely on the key names. Positions are metres in the camera ground frame (x forward,
 y right).

@@ -7,21 +7,19 @@ import datetime as dt
 import json
 import math
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import jsonschema
 import msgspec
 import numpy as np
 import pytest
+import reference_pages
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.errors import TelemetryError
 from bikeped.faults import Fault
 from bikeped.telemetry import builders as m
-from bikeped.telemetry import json_schema as schemas
 from bikeped.telemetry import schema as wire
 from bikeped.types import Decision, Detections, PairMetrics, State, Tracks
 
@@ -280,7 +278,8 @@ def test_timestamps_are_within_half_a_millisecond_and_valid(unix_s: float):
     back = dt.datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp()
     assert abs(back - unix_s) <= 0.0005 + 1e-6
     jsonschema.validate(
-        {**json.loads(m.encode(tracks_message())), "timestamp": text}, schemas.schema("tracks")
+        {**json.loads(m.encode(tracks_message())), "timestamp": text},
+        reference_pages.message_schema("tracks"),
     )
 
 
@@ -332,42 +331,15 @@ def test_availability_follows_its_schema():
         check.validate("away")
 
 
-def test_the_published_schemas_are_current():
-    published = {p.name: p.read_text(encoding="utf-8") for p in DOCS.glob("*.schema.json")}
-    assert published == schemas.schema_files(), (
-        "run python -m bikeped.telemetry.json_schema docs/messages"
-    )
-
-
-def test_the_schemas_command(tmp_path: Path):
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "bikeped.telemetry.json_schema", *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-
-    assert run(str(tmp_path / "new")).returncode == 0
-    written = {p.name: p.read_text(encoding="utf-8") for p in (tmp_path / "new").iterdir()}
-    assert written == schemas.schema_files()
-    assert run().returncode == 2
-    (tmp_path / "file").write_text("")
-    refused = run(str(tmp_path / "file"))
-    assert refused.returncode == 2
-    assert len(refused.stderr.splitlines()) == 1
-    assert "file: cannot be made" in refused.stderr
-
-
 def test_the_examples_in_the_documentation_are_valid_and_complete():
     text = (DOCS / "README.md").read_text(encoding="utf-8")
     examples = re.findall(r"<!-- schema: ([\w-]+) -->\s*```\w+\n(.*?)```", text, re.DOTALL)
-    assert {name for name, _ in examples} == set(schemas.MESSAGES)
+    assert {name for name, _ in examples} == set(reference_pages.MESSAGES)
     for name, example in examples:
         value = example.strip() if name == "availability" else json.loads(example)
         validator(name).validate(value)
         if name in REAL:  # no key that the code does not write, none left out
             assert keys(value).keys() == keys(json.loads(m.encode(REAL[name][0]))).keys()
-            msgspec.convert(value, schemas.MESSAGES[name])
-    for name in schemas.MESSAGES:
+            msgspec.convert(value, reference_pages.MESSAGES[name])
+    for name in reference_pages.MESSAGES:
         assert f"{name}.schema.json" in text

@@ -20,7 +20,7 @@ from aiohttp import web
 from msgspec import Meta
 
 from bikeped import __version__
-from bikeped.config.docs import key_descriptions
+from bikeped.config.json_schema import key_descriptions
 from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import DECIDING_CODE, code_hash
 from bikeped.config.schema import DecisionConfig, Section

@@ -1,24 +1,30 @@
-"""The page of all keys is made from the descriptions, and is current."""
+"""The pages made from the code are current: otherwise `python tests/reference_pages.py`."""
 
 import re
-from pathlib import Path
 
-from bikeped.config.docs import main, markdown
+import pytest
+import reference_pages
+
 from bikeped.config.validate import known_keys
 
-PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
+
+@pytest.mark.parametrize("path", reference_pages.pages(), ids=lambda path: path.name)
+def test_the_committed_page_is_current(path):
+    assert path.read_text(encoding="utf-8") == reference_pages.pages()[path], (
+        "run: python tests/reference_pages.py"
+    )
+
+
+def test_no_other_schema_is_published():
+    published = set((reference_pages.DOCS / "messages").glob("*.schema.json"))
+    assert published <= reference_pages.pages().keys()
 
 
 def rows():
     """Cells of every table row that describes a key."""
-    lines = [line for line in markdown().splitlines() if line.startswith("| `")]
+    page = reference_pages.configuration_page()
+    lines = [line for line in page.splitlines() if line.startswith("| `")]
     return [re.split(r"(?<!\\) \| ", line[2:-2]) for line in lines]
-
-
-def test_the_committed_page_is_current():
-    assert PAGE.read_text(encoding="utf-8") == markdown(), (
-        "run: python -m bikeped.config.docs docs/configuration.md"
-    )
 
 
 def test_every_key_stands_there_once_with_type_default_and_meaning():
@@ -42,10 +48,3 @@ def test_some_rows():
     assert table["feedback.gpio.red"][0] == "text or whole number 0 to 4095 or `null`"
     assert table["latency.compensation"][1] == '`"off"`'
     assert table["detection.providers"][1] == "`[tensorrt, cuda, cpu]`"
-
-
-def test_the_command_writes_the_page(tmp_path, capsys):
-    assert main([str(tmp_path / "page.md")]) == 0
-    assert (tmp_path / "page.md").read_text(encoding="utf-8") == markdown()
-    assert main([]) == 0
-    assert capsys.readouterr().out == markdown()

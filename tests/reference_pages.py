@@ -1,26 +1,65 @@
-"""The JSON Schema and the page of all keys, both from `config/schema.py`.
+"""Writes the pages of docs/ that are made from the code; tests hold that they are current.
 
-`python -m bikeped.config.docs docs/configuration.md` writes the page.
+`python tests/reference_pages.py` writes the configuration's keys, the table of faults, the JSON
+Schema of every message, and the picture of the house.
 """
 
 from __future__ import annotations
 
-import ast
-import inspect
-import sys
+import json
 from pathlib import Path
 from typing import Any
 
+import architecture_picture
 import msgspec
 
+from bikeped.config.json_schema import json_schema, key_descriptions
 from bikeped.config.schema import Config, sections
+from bikeped.faults import FAULT_KINDS
 from bikeped.files import write_whole
+from bikeped.telemetry import schema as messages
 
-_INTRO = """\
+DOCS = Path(__file__).parent.parent / "docs"
+
+#: file name (before .schema.json) -> type of the payload
+MESSAGES: dict[str, Any] = {
+    "tracks": messages.TracksMessage,
+    "state": messages.StateMessage,
+    "health": messages.HealthMessage,
+    "availability": messages.Availability,
+    "event-header": messages.EventHeader,
+    "event-frame": messages.EventLine,
+}
+
+
+def message_schema(name: str) -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of one message by its name in `MESSAGES`."""
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, "title": f"bikeped {name}", **msgspec.json.schema(MESSAGES[name])}
+
+
+def pages() -> dict[Path, str]:
+    """The text of every page by its path."""
+    schemas = {
+        DOCS / "messages" / f"{name}.schema.json": json.dumps(
+            message_schema(name), indent=2, ensure_ascii=False
+        )
+        + "\n"
+        for name in MESSAGES
+    }
+    return {
+        DOCS / "configuration.md": configuration_page(),
+        DOCS / "faults-reference.md": faults_page(),
+        architecture_picture.PICTURE: architecture_picture.draw() + "\n",
+        **schemas,
+    }
+
+
+_CONFIGURATION = """\
 # Configuration
 
-<!-- Made by `python -m bikeped.config.docs docs/configuration.md` from bikeped/config/schema.py;
-     change the descriptions there. -->
+<!-- Made by `python tests/reference_pages.py` from bikeped/config/schema.py; change the
+     descriptions there. -->
 
 Every key of `config.yaml`, in the order of the file. A key that is left out has its default. An
 unknown key is an error that names the nearest known one, and so is a key that is given twice.
@@ -43,31 +82,10 @@ at the working directory; `~` is the home directory.
 """
 
 
-def json_schema() -> dict[str, Any]:
-    """The JSON Schema of config.yaml, every key with its description."""
-    schema = msgspec.json.schema(Config)
-    for _, section in sections(Config):
-        properties = schema["$defs"][section.__name__]["properties"]
-        for key, text in key_descriptions(section).items():
-            properties[key]["description"] = text
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
-
-
-def key_descriptions(section: type[msgspec.Struct]) -> dict[str, str]:
-    """What each key of a section means: the text below it in the source."""
-    [tree] = ast.parse(inspect.getsource(section)).body
-    assert isinstance(tree, ast.ClassDef)  # noqa: S101 - for the type checker
-    return {
-        ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
-        for key, text in zip(tree.body, tree.body[1:], strict=False)
-        if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
-    }
-
-
-def markdown() -> str:
-    """The page: one table a section, nested sections after the one that holds them."""
+def configuration_page() -> str:
+    """docs/configuration.md: one table a section, nested sections after the one that holds them."""
     parts = json_schema()["$defs"]
-    lines = [_INTRO]
+    lines = [_CONFIGURATION]
     for path, section in sections(Config):
         keys = key_descriptions(section)
         if not keys:
@@ -113,14 +131,40 @@ def _values(item: dict[str, Any]) -> str:
     return f"{name} {item['minimum']:.7g} to {high:.7g}"
 
 
-def main(arguments: list[str]) -> int:
-    """Writes the page to the file named, or to standard output."""
-    if arguments:
-        write_whole(Path(arguments[0]), markdown())
-    else:
-        sys.stdout.write(markdown())
-    return 0
+_FAULTS = """\
+# Faults
+
+<!-- Made by `python tests/reference_pages.py` from the table in bikeped/faults.py; change it
+     there. -->
+
+What can be wrong, and what each fault does. The codes stand in `fault_codes` of the
+[health message](messages/README.md), beside the lines for people in `faults`. A fault whose light
+is FAULT makes the light blink orange, never blue or green; where it says "for IDLE and SAFE" the
+light blinks orange in place of blue and green, and WARNING and ALERT show as decided; one with an
+exit status also ends the process, so that systemd starts a fresh one.
+
+"""
+
+
+def faults_page() -> str:
+    """docs/faults-reference.md: one row a fault."""
+    rows = [
+        (
+            f"`{kind.code}`",
+            kind.meaning,
+            kind.effect.value,
+            kind.component,
+            kind.severity.name.lower(),
+            kind.clears.value,
+            "" if kind.exit_status is None else str(kind.exit_status),
+        )
+        for kind in FAULT_KINDS.values()
+    ]
+    head = ("code", "meaning", "light", "component", "severity", "clears", "exit status")
+    lines = [f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows)]
+    return _FAULTS + "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    for path, text in pages().items():
+        write_whole(path, text)
