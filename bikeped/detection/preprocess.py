@@ -121,7 +121,6 @@ class Preprocessor:
         # OpenCV has no look-up into half precision: its bits travel as 16-bit integers.
         self._planes = buffer[0].view(np.int16) if buffer.dtype == np.float16 else buffer[0]
         self._letterbox: Letterbox | None = None
-        self._copy_size = (0, 0)
         self._image: ImageArray = np.zeros((0, 0, 3), np.uint8)
         self._channel: ImageArray = np.zeros((0, 0), np.uint8)
 
@@ -134,13 +133,6 @@ class Preprocessor:
         cut; None: the frame's own.
         """
         copy_size = copy_size or (frame_width, frame_height)
-        last = self._letterbox
-        if (
-            last is not None
-            and (last.frame_width, last.frame_height) == (frame_width, frame_height)
-            and self._copy_size == copy_size
-        ):
-            return last
         part = None
         if self.region is not None and min(copy_size) > 0:
             across, down = frame_width / copy_size[0], frame_height / copy_size[1]
@@ -156,12 +148,12 @@ class Preprocessor:
         _check_image(rgb, frame_width, frame_height)
         copy_size = rgb.shape[1], rgb.shape[0]
         box = self.letterbox(frame_width, frame_height, copy_size)
-        if box is not self._letterbox:
+        if box != self._letterbox:
             for plane, table in zip(self._planes, self._tables, strict=True):
                 plane[...] = table[PAD]
             self._image = np.empty((box.height, box.width, 3), np.uint8)
             self._channel = np.empty((box.height, box.width), np.uint8)
-            self._letterbox, self._copy_size = box, copy_size
+            self._letterbox = box
         if self.region is not None:
             u1, v1, u2, v2 = self.region.pixels(*copy_size)
             rgb = rgb[v1:v2, u1:u2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bikeped.geometry.boxes import box_area, intersection_area
 from bikeped.overlay.drawing import (
     INK,
     KIND_COLOUR,
@@ -17,7 +18,6 @@ from bikeped.overlay.drawing import (
     fill_rect,
     hatch,
     outline,
-    overlap,
     place_label,
     polyline,
     readable_on,
@@ -40,7 +40,6 @@ def draw_overlay(
     *,
     scale: float = 1.0,
     ground_to_frame: GroundToFrame | None = None,
-    banner: bool = True,
 ) -> ImageArray:
     """A copy of `rgb` [h, w, 3] with the frame's results drawn over it.
 
@@ -48,7 +47,7 @@ def draw_overlay(
     `ground_to_frame`: puts unseen tracks and the pair line where they lie; without it unseen
     tracks are left out and the pair line joins the boxes.
     """
-    return _CameraView(rgb, data, scale, ground_to_frame).draw(banner)
+    return _CameraView(rgb, data, scale, ground_to_frame).draw()
 
 
 def draw_banner(image: ImageArray, data: OverlayData, rect: Rect) -> None:
@@ -101,10 +100,6 @@ def _text_height(w: int, h: int) -> int:
     return int(np.clip(round(min(h, w * 9 / 16) / 58), 9, 22))
 
 
-def _banner_height(w: int, h: int) -> int:
-    return int(np.clip(round(min(h, w * 9 / 16) * 0.085), 30, 96))
-
-
 class _CameraView:
     """One picture in the making; pixels are those of the drawn picture."""
 
@@ -125,11 +120,10 @@ class _CameraView:
         self.taken: list[Rect] = []  #: covered by text already
         self.labels: list[tuple[str, Rect, Rgb]] = []
 
-    def draw(self, banner: bool) -> ImageArray:
+    def draw(self) -> ImageArray:
         """The finished picture."""
         w, h = self.w, self.h
-        top = _banner_height(w, h) if banner else 0
-        self.bounds: Rect = (2, top + 2, w - 2, h - 2)
+        self.bounds: Rect = (2, 2, w - 2, h - 2)
         footer_text, footer_rect = self._footer()
         line = self._pair_line()
         if line is not None:
@@ -139,25 +133,26 @@ class _CameraView:
         self._draw_unseen()
         self._draw_boxes()
         self._draw_distance(line)
-        shown = [label for label in self.labels if overlap(label[1], (0, 0, w, h)) > 0]
+        shown = [
+            label
+            for label in self.labels
+            if intersection_area(np.array(label[1]), np.array([0, 0, w, h])) > 0
+        ]
         avoid = [box for _, box, _ in shown]
         for text, box, colour in shown:
             self._draw_label(text, box, colour, avoid)
         fill_rect(self.image, footer_rect, INK, 0.72)
         at = (self.size, footer_rect[1] + 0.6 * self.size)
         draw_text(self.image, footer_text, at, self.size, PAPER)
-        if banner:
-            draw_banner(self.image, self.data, (0, 0, w, top))
         return self.image
 
     def _draw_boxes(self) -> None:
         """Boxes, small ones over large ones; adds their self.labels, those of the pair first."""
         tracks = self.data.tracks
         row_of = {int(d): i for i, d in enumerate(tracks.detection) if d >= 0}
-        area = (self.boxes[:, 2] - self.boxes[:, 0]) * (self.boxes[:, 3] - self.boxes[:, 1])
         line = self.line_px
         entries: list[tuple[bool, str, Rect, Rgb]] = []
-        for d in np.argsort(-area, kind="stable").tolist():
+        for d in np.argsort(-box_area(self.boxes), kind="stable").tolist():
             x0, y0, x1, y1 = box = tuple(self.boxes[d].tolist())
             row = row_of.get(d)
             kind = Kind(int(self.data.detections.kind[d]))

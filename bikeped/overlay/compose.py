@@ -23,7 +23,6 @@ def compose(
     *,
     frame_width: int | None = None,
     ground_to_frame: GroundToFrame | None = None,
-    range_m: float = 25.0,
     fov_deg: float = 198.0,
     heading_deg: float = 0.0,
 ) -> ImageArray:
@@ -41,18 +40,14 @@ def compose(
     how = cv2.INTER_AREA if fit < 1 else cv2.INTER_LINEAR
     small = np.asarray(cv2.resize(rgb, (pw, ph), interpolation=how), dtype=np.uint8)
     picture = draw_overlay(
-        small, data, scale=pw / (frame_width or w), ground_to_frame=ground_to_frame, banner=False
+        small, data, scale=pw / (frame_width or w), ground_to_frame=ground_to_frame
     )
     out: ImageArray = np.empty((height, width, 3), np.uint8)
     out[:] = INK
     y = top + (height - top - ph) // 2
     out[y : y + ph, (left - pw) // 2 : (left - pw) // 2 + pw] = picture
     out[top:, left:] = draw_radar(
-        data,
-        (width - left, height - top),
-        range_m=range_m,
-        fov_deg=fov_deg,
-        heading_deg=heading_deg,
+        data, (width - left, height - top), fov_deg=fov_deg, heading_deg=heading_deg
     )
     draw_banner(out, data, (0, 0, width, top))
     return out

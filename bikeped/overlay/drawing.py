@@ -13,6 +13,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from bikeped.geometry.boxes import intersection_area
 from bikeped.types import FloatArray, ImageArray, Kind
 
 Rgb = tuple[int, int, int]
@@ -169,18 +170,12 @@ def arrow(
     thickness: int,
     head_px: float,
 ) -> None:
-    """A line from `tail` to `tip` with a filled head."""
-    direction = np.asarray(tip, dtype=np.float64) - tail
-    length = float(np.hypot(*direction))
-    if not length > 1e-6:
-        return
-    along = direction / length
-    across = np.array([-along[1], along[0]])
-    neck = tip - along * min(head_px, length)
-    polyline(image, np.stack([tail, neck]), colour, thickness)
-    polygon(
-        image, np.stack([tip, neck + across * head_px / 2, neck - across * head_px / 2]), colour
-    )
+    """A line from `tail` to `tip` with a head."""
+    length = float(np.hypot(*(tip - tail)))
+    if length > 1e-6:
+        a, b = _fixed(np.stack([tail, tip])).tolist()
+        head = min(head_px / length, 1.0)
+        cv2.arrowedLine(image, a, b, colour, thickness, cv2.LINE_AA, _SHIFT, head)
 
 
 def hatch(image: ImageArray, rect: Rect, a: Rgb, b: Rgb, width_px: int) -> None:
@@ -189,13 +184,6 @@ def hatch(image: ImageArray, rect: Rect, a: Rgb, b: Rgb, width_px: int) -> None:
     y, x = np.mgrid[area]
     stripe = ((x + y) // max(width_px, 1)) % 2 == 0
     image[area] = np.where(stripe[..., None], np.array(a, np.uint8), np.array(b, np.uint8))
-
-
-def overlap(a: Rect, b: Rect) -> float:
-    """Area that two rectangles share."""
-    w = min(a[2], b[2]) - max(a[0], b[0])
-    h = min(a[3], b[3]) - max(a[1], b[1])
-    return max(w, 0.0) * max(h, 0.0)
 
 
 def place_label(
@@ -219,19 +207,19 @@ def place_label(
     spots += [(x1 + gap, y0), (x0 - w - gap, y0), (x1 + gap, y1 - h), (x0 - w - gap, y1 - h)]
     for row in (2, 3, 4):
         spots += [(x0, y0 - row * (h + gap)), (x0, y1 + gap + (row - 1) * (h + gap))]
-    best: Rect = (x0, y0, x0 + w, y0 + h)
-    least = float("inf")
-    for order, (x, y) in enumerate(spots):
-        # A label pushed back inside may then cover its own box: that counts a little too.
-        x = min(max(x, bounds[0]), max(bounds[2] - w, bounds[0]))
-        y = min(max(y, bounds[1]), max(bounds[3] - h, bounds[1]))
-        spot = (x, y, x + w, y + h)
-        cost = sum(overlap(spot, other) for other in taken)
-        cost += 0.3 * sum(overlap(spot, other) for other in avoid)
-        cost += 0.3 * overlap(spot, box) + 0.01 * order
-        if cost < least:
-            best, least = spot, cost
-    return best
+    lowest, highest = np.array(bounds[:2]), np.array(bounds[2:]) - size
+    corner = np.clip(spots, lowest, np.maximum(highest, lowest))
+    spot = np.hstack([corner, corner + size])
+
+    def hidden(rects: Sequence[Rect]) -> FloatArray:
+        """The area of `rects` that each spot covers."""
+        other = np.array(rects, np.float64).reshape(-1, 4)
+        return np.asarray(intersection_area(spot[:, None], other[None]).sum(axis=1))
+
+    # A label pushed back inside may then cover its own box: that counts a little too.
+    cost = hidden(taken) + 0.3 * hidden([*avoid, box]) + 0.01 * np.arange(len(spot))
+    left, top, right, bottom = spot[cost.argmin()].tolist()
+    return left, top, right, bottom
 
 
 def draw_tag(

@@ -30,6 +30,8 @@ from bikeped.overlay.drawing import (
 from bikeped.overlay.overlay_data import OverlayData
 from bikeped.types import FloatArray, ImageArray, Kind
 
+#: Shown ahead and to both sides.
+RANGE_M = 25.0
 RING_STEP_M = 5.0
 #: An arrow shows where its object will be after this long.
 ARROW_S = 1.0
@@ -47,20 +49,19 @@ class RadarProjection:
 
     width: int
     height: int
-    range_m: float
     u0: float  #: the camera's pixel
     v0: float
     px_per_m: float
 
     @staticmethod
-    def fit(width: int, height: int, range_m: float = 25.0) -> RadarProjection:
-        """The largest radar that fits, `range_m` ahead and to both sides, a fifth of it behind."""
+    def fit(width: int, height: int) -> RadarProjection:
+        """The largest radar that fits, `RANGE_M` ahead and to both sides, a fifth of it behind."""
         margin = max(round(min(width, height) * 0.03), 6)
-        side = (width / 2 - margin) / range_m
-        tall = (height - 2 * margin) / (range_m * (1 + _BEHIND))
+        side = (width / 2 - margin) / RANGE_M
+        tall = (height - 2 * margin) / (RANGE_M * (1 + _BEHIND))
         scale = min(side, tall)
-        top = margin + max(0.0, (tall - scale) * range_m * (1 + _BEHIND)) * 0.25
-        return RadarProjection(width, height, range_m, width / 2, top + scale * range_m, scale)
+        top = margin + max(0.0, (tall - scale) * RANGE_M * (1 + _BEHIND)) * 0.25
+        return RadarProjection(width, height, width / 2, top + scale * RANGE_M, scale)
 
     def pixels(self, xy_m: npt.ArrayLike) -> FloatArray:
         """Radar pixels [..., 2] of camera ground positions [..., 2] (x forward, y right)."""
@@ -71,38 +72,28 @@ class RadarProjection:
 
 
 def draw_radar(
-    data: OverlayData,
-    size: tuple[int, int],
-    *,
-    range_m: float = 25.0,
-    fov_deg: float = 198.0,
-    heading_deg: float = 0.0,
+    data: OverlayData, size: tuple[int, int], *, fov_deg: float = 198.0, heading_deg: float = 0.0
 ) -> ImageArray:
     """The radar as a picture of `size` (width, height).
 
     `heading_deg`: the optical axis, to the right of the ground frame's x axis; it turns the
-    field of view's wedge. Tracks beyond `range_m` are drawn as marks on the outermost ring.
+    field of view's wedge. Tracks beyond `RANGE_M` are drawn as marks on the outermost ring.
     """
-    return _RadarView(data, size, range_m, fov_deg, heading_deg).draw()
+    return _RadarView(data, size, fov_deg, heading_deg).draw()
 
 
 class _RadarView:
     """One radar picture in the making."""
 
     def __init__(
-        self,
-        data: OverlayData,
-        size: tuple[int, int],
-        range_m: float,
-        fov_deg: float,
-        heading_deg: float,
+        self, data: OverlayData, size: tuple[int, int], fov_deg: float, heading_deg: float
     ) -> None:
-        self.frame = RadarProjection.fit(*size, range_m)
+        self.frame = RadarProjection.fit(*size)
         self.image = _base(self.frame, fov_deg, heading_deg).copy()
         self.data, self.tracks, self.text = data, data.tracks, _text_height(size)
         self.at = self.frame.pixels(data.tracks.xy_m)
         self.reach = np.hypot(*data.tracks.xy_m.T)
-        self.near = self.reach <= range_m
+        self.near = self.reach <= RANGE_M
         self.taken: list[Rect] = []
 
     def draw(self) -> ImageArray:
@@ -119,7 +110,7 @@ class _RadarView:
         for row in range(len(tracks)):
             kind, at = Kind(int(tracks.kind[row])), self.at[row]
             if not self.near[row]:
-                rim = tracks.xy_m[row] / max(self.reach[row], 1e-9) * self.frame.range_m
+                rim = tracks.xy_m[row] / max(self.reach[row], 1e-9) * RANGE_M
                 circle(image, self.frame.pixels(rim), text * 0.35, shade(KIND_COLOUR[kind], 0.7))
                 continue
             if row in rows and data.alerting:
@@ -176,13 +167,13 @@ class _RadarView:
     def _draw_list(self) -> None:
         """Table of the tracks below the radar, nearest first, as many as fit."""
         image, frame, tracks, text = self.image, self.frame, self.tracks, self.text
-        top = frame.v0 + frame.range_m * frame.px_per_m * _BEHIND + text * 1.6
+        top = frame.v0 + RANGE_M * frame.px_per_m * _BEHIND + text * 1.6
         line = text * 2.1
         room = int((frame.height - top - text * 0.6) / line)
         if room < 2:
             return
-        left = frame.u0 - frame.range_m * frame.px_per_m
-        width = 2 * frame.range_m * frame.px_per_m
+        left = frame.u0 - RANGE_M * frame.px_per_m
+        width = 2 * RANGE_M * frame.px_per_m
         name_x, columns = left + text * 2.2, [left + width * share for share in (0.56, 0.78, 1)]
 
         def draw_row(y: float, name: str, words: tuple[str, str], ink: Rgb) -> None:
@@ -216,18 +207,18 @@ def _base(frame: RadarProjection, fov_deg: float, heading_deg: float) -> ImageAr
     text = _text_height((frame.width, frame.height))
     half = math.radians(min(fov_deg, 360.0)) / 2
     turn = math.radians(heading_deg) + np.linspace(-half, half, 181)
-    arc = frame.range_m * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    arc = RANGE_M * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     wedge = np.concatenate([np.zeros((1, 2)), arc])
     polygon(image, frame.pixels(wedge), _SEEN)
     full = np.linspace(-np.pi, np.pi, 721)
     unit = np.stack([np.cos(full), np.sin(full)], axis=1)
     for degrees in range(-90, 91, 30):
         a = math.radians(degrees)
-        spoke = np.array([[0.0, 0.0], [frame.range_m * math.cos(a), frame.range_m * math.sin(a)]])
+        spoke = np.array([[0.0, 0.0], [RANGE_M * math.cos(a), RANGE_M * math.sin(a)]])
         polyline(image, frame.pixels(spoke), shade(_RING, 0.6), 1)
-    rings = np.arange(RING_STEP_M, frame.range_m + 1e-6, RING_STEP_M)
+    rings = np.arange(RING_STEP_M, RANGE_M + 1e-6, RING_STEP_M)
     for ring in rings.tolist():
-        shown = np.where((ring * unit[:, :1]) >= -frame.range_m * _BEHIND, ring * unit, np.nan)
+        shown = np.where((ring * unit[:, :1]) >= -RANGE_M * _BEHIND, ring * unit, np.nan)
         polyline(image, frame.pixels(shown), _RING, 1)
     for ring in rings.tolist():
         # On the 15-degree ray, between the spokes, where neither the way ahead nor a spoke is hit.
@@ -236,7 +227,7 @@ def _base(frame: RadarProjection, fov_deg: float, heading_deg: float) -> ImageAr
         wide = text_size(word, text)[0]
         u, v = at[0], at[1]
         back = (u - wide / 2 - 2, v - text / 2 - 3, u + wide / 2 + 2, v + text / 2 + 3)
-        fill_rect(image, back, _SEEN if ring < frame.range_m else _GROUND)
+        fill_rect(image, back, _SEEN if ring < RANGE_M else _GROUND)
         draw_text(image, word, (at[0], at[1] - text / 2), text, _FAINT, anchor="centre")
     edge = frame.pixels(np.stack([arc[0], np.zeros(2), arc[-1]]))
     dashed(image, edge, _FAINT, 1, 5.0)

@@ -107,7 +107,7 @@ class PictureRenderer:
     ) -> bytes:
         rgb = self._picture(decoder, result)
         scale = rgb.shape[1] / result.decoded.frame.width
-        drawn = draw_overlay(rgb, data, scale=scale, ground_to_frame=to_frame, banner=False)
+        drawn = draw_overlay(rgb, data, scale=scale, ground_to_frame=to_frame)
         return encode_jpeg(drawn, _QUALITY)
 
     def _picture(self, decoder: JpegDecoder, result: FrameResult) -> ImageArray:

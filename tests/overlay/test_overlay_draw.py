@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
+from bikeped.geometry.boxes import intersection_area
 from bikeped.overlay.drawing import (
     INK,
     KIND_COLOUR,
     PAPER,
     fill_rect,
     fit_text,
-    overlap,
     place_label,
     polyline,
     readable_on,
@@ -38,7 +38,7 @@ def test_labels_of_a_crowd_do_not_cover_one_another():
     for i in range(5):
         box = (180 + 4 * i, 140 + 2 * i, 200 + 4 * i, 190 + 2 * i)
         spot = place_label((80, 16), box, taken, BOUNDS)
-        assert all(overlap(spot, other) == 0 for other in taken)
+        assert all(intersection_area(np.array(spot), np.array(other)) == 0 for other in taken)
         taken.append(spot)
 
 

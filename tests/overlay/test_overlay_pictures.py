@@ -52,7 +52,7 @@ def changed(a, b):
 
 @pytest.mark.parametrize("state", list(State))
 def test_banner_has_the_colour_of_the_light(state):
-    image = draw_overlay(GREY, moment(state))
+    image = compose(GREY, moment(state), (768, 432))
     assert image.shape == GREY.shape
     assert tuple(image[2, 2].tolist()) == SIGNAL_COLOUR[state.name]
     assert (GREY == 120).all(), "the picture given was drawn into"
@@ -60,7 +60,7 @@ def test_banner_has_the_colour_of_the_light(state):
 
 def test_fault_is_hatched_and_never_blue_green_or_red():
     signal = Signal("FAULT", Colour.ORANGE, faults=(Fault("camera", "camera.error", "silent"),))
-    image = draw_overlay(GREY, moment(State.ALERT, signal=signal))
+    image = compose(GREY, moment(State.ALERT, signal=signal), (768, 432))
     strip = image[1]
     assert has(strip[None], SIGNAL_COLOUR["FAULT"])
     assert has(strip[None], INK)
@@ -73,15 +73,15 @@ def test_boxes_lie_where_the_detector_said_at_any_scale():
     for scale in (1.0, 0.5):
         size = (round(768 * scale), round(432 * scale))
         rgb = np.full((size[1], size[0], 3), 120, np.uint8)
-        image = draw_overlay(rgb, quiet, scale=scale, banner=False)
+        image = draw_overlay(rgb, quiet, scale=scale)
         u, v = round(500 * scale), round(205 * scale)
         assert tuple(image[v, u].tolist()) == KIND_COLOUR[Kind.CYCLIST]
         assert tuple(image[v, u + round(30 * scale)].tolist()) == (120, 120, 120)
 
 
 def test_alert_makes_the_pair_stand_out_and_warning_does_not():
-    alert = draw_overlay(GREY, moment(State.ALERT), banner=False)
-    warning = draw_overlay(GREY, moment(State.WARNING), banner=False)
+    alert = draw_overlay(GREY, moment(State.ALERT))
+    warning = draw_overlay(GREY, moment(State.WARNING))
     assert has(alert, SIGNAL_COLOUR["ALERT"])
     assert not has(warning, SIGNAL_COLOUR["ALERT"])
     assert has(warning, SIGNAL_COLOUR["WARNING"])
@@ -91,8 +91,8 @@ def test_an_unseen_track_is_drawn_where_it_is_on_the_ground():
     def to_frame(xy):
         return np.stack([384 + 20 * xy[:, 1], 432 - 10 * xy[:, 0]], axis=1)
 
-    with_track = draw_overlay(GREY, moment(State.IDLE), ground_to_frame=to_frame, banner=False)
-    without = draw_overlay(GREY, moment(State.IDLE), banner=False)
+    with_track = draw_overlay(GREY, moment(State.IDLE), ground_to_frame=to_frame)
+    without = draw_overlay(GREY, moment(State.IDLE))
     v, u = np.nonzero(changed(with_track, without))
     ring = (v >= 432 - 150) & (v <= 432 - 144 + 3)  # its lower half: the label is above
     assert ring.any()
