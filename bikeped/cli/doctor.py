@@ -42,13 +42,13 @@ def command(
     except BikepedError as error:
         if not file.is_file() or overrides:
             raise  # the command line is wrong, not the installation
-        findings.append(Finding("configuration", "fail", str(error), "the other checks need it"))
+        findings.append(Finding("fail", str(error), "the other checks need it", "configuration"))
     else:
         todo = checks(light=not no_light, sound=not no_sound)
         with console("-").status("checking") as status:  # on standard error
-            for check, finding in zip(todo, run_checks(loaded, todo), strict=True):
+            for finding in run_checks(loaded, todo):
                 findings.append(finding)
-                status.update(f"checking, {check.name} done")
+                status.update(f"checking, {finding.name} done")
     failed = any(finding.status == "fail" for finding in findings)
     report = {
         "ok": not failed,

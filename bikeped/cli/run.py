@@ -82,7 +82,6 @@ def replay(
     json_path: str | None,
 ) -> int:
     """Run VIDEO (a file or a folder of pictures) through the loop; print its decisions."""
-    from bikeped.pipeline.replay import ReplayFiles
     from bikeped.pipeline.replay import replay as replay_video
 
     if web_place is not None:
@@ -103,7 +102,8 @@ def replay(
         result = replay_video(
             loaded,
             video,
-            files=ReplayFiles(events, overlay),
+            events=events,
+            overlay=overlay,
             realtime=realtime or pages is not None,
             mqtt=not no_mqtt,
             progress=progress,

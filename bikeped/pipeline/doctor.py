@@ -6,18 +6,17 @@ service cannot work, `warn` that it works, but a person should look into it.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import datetime as dt
 import math
 import os
-import queue
 import shutil
 import statistics
 import subprocess
-import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -33,6 +32,7 @@ from bikeped.feedback.sounds import make_wav
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import load_detector_pool
 from bikeped.pipeline.detection_scheduler import DecodedFrame
+from bikeped.pipeline.runtime import WorkerThread
 from bikeped.pipeline.track_and_decide import GroundMapper
 from bikeped.telemetry.mqtt_connection import BrokerConnection, load_credentials
 from bikeped.types import Frame, Sound
@@ -48,62 +48,62 @@ MB = 1_000_000
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found; `remedy` says what to do."""
+    """What one check found; `remedy` says what to do. `run_checks` fills the name in."""
 
-    name: str
     status: Status
     detail: str
     remedy: str = ""
+    name: str = ""
 
 
-@dataclass(frozen=True)
-class Check:
-    """One check, and the longest that it may take in seconds."""
-
-    name: str
-    function: Callable[[LoadedConfig], Finding]
-    limit_s: float
+#: Name of a check, its function, and the longest that it may take in seconds.
+Check = tuple[str, Callable[[LoadedConfig], Finding], float]
 
 
 def checks(*, light: bool = True, sound: bool = True) -> tuple[Check, ...]:
     """All checks in the order of the table; without `light` no lamp is touched."""
     return (
-        Check("configuration", check_configuration, 60),
-        Check("camera", check_camera, 30),
+        ("configuration", check_configuration, 60),
+        ("camera", check_camera, 30),
         # Building an engine for the first time takes minutes.
-        Check("model", check_model, 1800),
-        Check("light", check_light if light else _skip("light", "--no-light"), 15),
-        Check("speaker", check_speaker if sound else _skip("speaker", "--no-sound"), 15),
-        Check("broker", check_broker, 15),
-        Check("clock", check_clock, 10),
-        Check("disk", check_disk, 10),
-        Check("machine", check_machine, 10),
+        ("model", check_model, 1800),
+        ("light", check_light if light else _skip("--no-light"), 15),
+        ("speaker", check_speaker if sound else _skip("--no-sound"), 15),
+        ("broker", check_broker, 15),
+        ("clock", check_clock, 10),
+        ("disk", check_disk, 10),
+        ("machine", check_machine, 10),
     )
 
 
-def run_checks(loaded: LoadedConfig, todo: tuple[Check, ...]) -> Iterator[Finding]:
+def _skip(option: str) -> Callable[[LoadedConfig], Finding]:
+    return lambda _loaded: Finding("skipped", f"left out by {option}")
+
+
+def run_checks(loaded: LoadedConfig, todo: Iterable[Check]) -> Iterator[Finding]:
     """The findings one by one. A check that hangs is left behind in its thread."""
-    return (_run_bounded(check, loaded) for check in todo)
-
-
-def _run_bounded(check: Check, loaded: LoadedConfig) -> Finding:
-    answers: queue.SimpleQueue[Finding] = queue.SimpleQueue()
-
-    def work() -> None:
+    for name, function, limit_s in todo:
         try:
-            answers.put(check.function(loaded))
+            finding = asyncio.run(_run_bounded(function, loaded, limit_s))
         except BikepedError as error:
-            answers.put(Finding(check.name, "fail", *_split(str(error))))
+            finding = _failed(error)
         except Exception as error:  # noqa: BLE001 - one check must not end the others
             text = f"unexpected {type(error).__name__}: {error}"
-            answers.put(Finding(check.name, "fail", text, "report this"))
+            finding = Finding("fail", text, "report this")
+        yield replace(finding, name=name)
 
-    threading.Thread(target=work, name=f"doctor-{check.name}", daemon=True).start()
-    try:
-        return answers.get(timeout=check.limit_s)
-    except queue.Empty:
-        text = f"no answer within {check.limit_s:g} s"
-        return Finding(check.name, "fail", text, "unplug the device, or restart")
+
+async def _run_bounded(
+    function: Callable[[LoadedConfig], Finding], loaded: LoadedConfig, limit_s: float
+) -> Finding:
+    worker = WorkerThread("doctor")
+    answer = worker.submit(function, loaded)
+    await asyncio.wait({answer}, timeout=limit_s)
+    await worker.close(0.0)
+    if answer.cancel():
+        text = f"no answer within {limit_s:g} s"
+        return Finding("fail", text, "unplug the device, or restart")
+    return answer.result()
 
 
 def check_configuration(loaded: LoadedConfig) -> Finding:
@@ -111,51 +111,38 @@ def check_configuration(loaded: LoadedConfig) -> Finding:
     camera = GroundMapper(loaded).camera
     lens = f"{camera.lens.projection}, f = {camera.lens.focal_px:.1f} px"
     pose = f"{camera.height_m:g} m up, pitch {camera.pitch_deg:g} degrees"
-    return Finding("configuration", "ok", f"{loaded.source}, {loaded.hash[:12]}; {lens}, {pose}")
+    return Finding("ok", f"{loaded.source}, {loaded.hash[:12]}; {lens}, {pose}")
 
 
 def check_camera(loaded: LoadedConfig) -> Finding:
     """Opens the camera, reads for a second, decodes the last frame."""
     camera = loaded.config.camera
     try:
-        frames, seconds, granted_fps, live = _read_frames(loaded)
+        with open_source(camera) as source:
+            last, more = source.read(), 0
+            # Counted from the first frame on, which comes with what starting a camera takes.
+            began = ended = time.monotonic()
+            while ended - began < MEASURE_S and (frame := source.read()) is not None:
+                last, more, ended = frame, more + 1, time.monotonic()
+        if last is None:
+            raise CaptureError(f"{camera.source}: holds no frame; set camera.source to another")
     except CaptureError as error:
-        return _device_error("camera", error)
-    last = frames[-1]
+        return _failed(error, device=True)
     GroundMapper(loaded).framing_for(last.width, last.height)
-    began = time.perf_counter()
+    decoding = time.perf_counter()
     if last.jpeg is not None:
         JpegDecoder().decode(last.jpeg)
-    decode_ms = (time.perf_counter() - began) * 1e3
+    decode_ms = (time.perf_counter() - decoding) * 1e3
     what = f"{camera.source}: {last.width} x {last.height}"
-    if not live:
-        return Finding("camera", "warn", f"{what}, a recording", "set camera.source to a camera")
-    fps = (len(frames) - 1) / seconds if len(frames) > 1 else 0.0
-    rate = f"{fps:.1f} frames/s measured, {granted_fps:g} granted"
+    if not source.live:
+        return Finding("warn", f"{what}, a recording", "set camera.source to a camera")
+    fps = more / max(ended - began, 1e-9)
+    rate = f"{fps:.1f} frames/s measured, {source.fps:g} granted"
     detail = f"{what}, {rate}, decoded in {decode_ms:.1f} ms"
     if fps < 0.8 * camera.fps:
         remedy = f"camera.fps asks for {camera.fps:g}: is it dark (long exposure), the cable USB 3?"
-        return Finding("camera", "warn", detail, remedy)
-    return Finding("camera", "ok", detail)
-
-
-def _read_frames(loaded: LoadedConfig) -> tuple[list[Frame], float, float, bool]:
-    """Frames of a second (or of a recording), the seconds they took, granted rate, whether live."""
-    camera = loaded.config.camera
-    with open_source(camera) as source:
-        frames: list[Frame] = []
-        began = ended = time.monotonic()
-        while ended - began < MEASURE_S:
-            frame = source.read()
-            if frame is None:
-                break
-            if not frames:
-                began = time.monotonic()  # the first frame comes with what starting a camera takes
-            frames = [*frames[-1000:], frame]
-            ended = time.monotonic()
-        if not frames:
-            raise CaptureError(f"{camera.source}: holds no frame; set camera.source to another")
-        return frames, max(ended - began, 1e-9), source.fps, source.live
+        return Finding("warn", detail, remedy)
+    return Finding("ok", detail)
 
 
 def check_model(loaded: LoadedConfig) -> Finding:
@@ -175,13 +162,12 @@ def check_model(loaded: LoadedConfig) -> Finding:
     ms = statistics.median(times)
     detail = f"{detector.name}: {ms:.1f} ms a frame, loaded in {loaded_s:.1f} s"
     if loaded.config.detection.model == BUNDLED:
-        detail = f"{detail}; {NOT_FOR_STREETS}"
         remedy = "set detection.model to one trained on real streets"
-        return Finding("model", "warn", detail, remedy)
+        return Finding("warn", f"{detail}; {NOT_FOR_STREETS}", remedy)
     if ms > 1e3 / camera.fps:
         remedy = "use the GPU (detection.providers) or a smaller model"
-        return Finding("model", "warn", f"{detail}, slower than {camera.fps:g} frames/s", remedy)
-    return Finding("model", "ok", detail)
+        return Finding("warn", f"{detail}, slower than {camera.fps:g} frames/s", remedy)
+    return Finding("ok", detail)
 
 
 def check_light(loaded: LoadedConfig) -> Finding:
@@ -193,21 +179,21 @@ def check_light(loaded: LoadedConfig) -> Finding:
                 light.set(colour)
                 time.sleep(LAMP_S)
     except BikepedError as error:
-        return _device_error("light", error)
+        return _failed(error, device=True)
     if feedback.light == "simulated":
-        return Finding("light", "warn", "simulated: no lamp is connected", "set feedback.light")
+        return Finding("warn", "simulated: no lamp is connected", "set feedback.light")
     names = ", ".join(colour.value for colour in LAMP_COLOURS)
-    return Finding("light", "ok", f"{feedback.light} answers; did you see {names}, then dark?")
+    return Finding("ok", f"{feedback.light} answers; did you see {names}, then dark?")
 
 
 def check_speaker(loaded: LoadedConfig) -> Finding:
     """Plays the chime."""
     sound = loaded.config.feedback.sound
     if not sound.enabled:
-        return Finding("speaker", "skipped", "feedback.sound.enabled is false")
+        return Finding("skipped", "feedback.sound.enabled is false")
     program = shutil.which("aplay")
     if program is None:
-        return Finding("speaker", "fail", "aplay is not installed", "apt-get install alsa-utils")
+        return Finding("fail", "aplay is not installed", "apt-get install alsa-utils")
     done = subprocess.run(
         [program, "-q", "-D", sound.device],
         input=make_wav(Sound.CHIME, sound.volume),
@@ -218,15 +204,15 @@ def check_speaker(loaded: LoadedConfig) -> Finding:
     if done.returncode != 0:
         message = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no message"]
         remedy = "set feedback.sound.device to one that `aplay -L` lists"
-        return Finding("speaker", "fail", f"{sound.device}: {message[-1]}", remedy)
-    return Finding("speaker", "ok", f"{sound.device}: did you hear the chime?")
+        return Finding("fail", f"{sound.device}: {message[-1]}", remedy)
+    return Finding("ok", f"{sound.device}: did you hear the chime?")
 
 
 def check_broker(loaded: LoadedConfig) -> Finding:
     """Connects to the broker, with a client id of its own: the service's connection stays."""
     mqtt = loaded.config.mqtt
     if not mqtt.enabled:
-        return Finding("broker", "skipped", "mqtt.enabled is false")
+        return Finding("skipped", "mqtt.enabled is false")
     connection = BrokerConnection(
         mqtt,
         load_credentials(mqtt, loaded.base_dir),
@@ -239,11 +225,11 @@ def check_broker(loaded: LoadedConfig) -> Finding:
     except OSError as error:
         detail = f"{mqtt.host}:{mqtt.port}: {' '.join(str(error).split())}"
         remedy = "check mqtt.host, mqtt.port, mqtt.username, mqtt.tls, and that the broker runs"
-        return Finding("broker", "warn", detail, remedy)  # the service works without a broker
+        return Finding("warn", detail, remedy)  # the service works without a broker
     finally:
         connection.close()
     took_ms = (time.perf_counter() - began) * 1e3
-    return Finding("broker", "ok", f"{mqtt.host}:{mqtt.port} answers in {took_ms:.0f} ms")
+    return Finding("ok", f"{mqtt.host}:{mqtt.port} answers in {took_ms:.0f} ms")
 
 
 def check_clock(_loaded: LoadedConfig) -> Finding:
@@ -252,35 +238,35 @@ def check_clock(_loaded: LoadedConfig) -> Finding:
     text = f"{now:%Y-%m-%d %H:%M} UTC"
     remedy = "timedatectl set-ntp true; is there a network, or a battery for the clock?"
     if now.year < FIRST_YEAR:
-        return Finding("clock", "warn", f"{text}: was never set", remedy)
+        return Finding("warn", f"{text}: was never set", remedy)
     synchronised = _output_of("timedatectl", "show", "--property=NTPSynchronized", "--value")
     if synchronised is None:
-        return Finding("clock", "ok", f"{text}; synchronisation unknown (no timedatectl)")
+        return Finding("ok", f"{text}; synchronisation unknown (no timedatectl)")
     if synchronised != "yes":
-        return Finding("clock", "warn", f"{text}, not synchronised", remedy)
-    return Finding("clock", "ok", f"{text}, synchronised")
+        return Finding("warn", f"{text}, not synchronised", remedy)
+    return Finding("ok", f"{text}, synchronised")
 
 
 def check_disk(loaded: LoadedConfig) -> Finding:
     """Whether the audit log has room and may be written."""
     audit = loaded.config.audit
     if audit.path is None:
-        return Finding("disk", "skipped", "audit.path is null: no audit log")
+        return Finding("skipped", "audit.path is null: no audit log")
     path = loaded.base_dir / audit.path
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     free_mb = shutil.disk_usage(folder).free / MB
     detail = f"{path}: {free_mb:.0f} MB free"
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
         remedy = "set audit.path to a folder that the service may write"
-        return Finding("disk", "warn", f"{path}: {folder} cannot be written", remedy)
+        return Finding("warn", f"{path}: {folder} cannot be written", remedy)
     if free_mb < audit.min_free_mb:
         detail += f", audit.min_free_mb is {audit.min_free_mb:g}: nothing is logged"
-        return Finding("disk", "warn", detail, "free disk space")
+        return Finding("warn", detail, "free disk space")
     full_mb = audit.max_mb * (audit.keep + 1)
     if free_mb - full_mb < audit.min_free_mb and not path.exists():
         detail += f", the log may grow to {full_mb:.0f} MB"
-        return Finding("disk", "warn", detail, "lower audit.max_mb or audit.keep")
-    return Finding("disk", "ok", detail)
+        return Finding("warn", detail, "lower audit.max_mb or audit.keep")
+    return Finding("ok", detail)
 
 
 def check_machine(_loaded: LoadedConfig, zones: Path = Path("/sys/class/thermal")) -> Finding:
@@ -290,10 +276,10 @@ def check_machine(_loaded: LoadedConfig, zones: Path = Path("/sys/class/thermal"
     power_mode = " ".join((_output_of("nvpmodel", "-q") or "").split())
     detail = "; ".join(filter(None, (temperature, power_mode)))
     if not detail:
-        return Finding("machine", "skipped", "temperature and power mode cannot be read here")
+        return Finding("skipped", "temperature and power mode cannot be read here")
     if hottest > HOT_C:
-        return Finding("machine", "warn", detail, "provide shade and ventilation")
-    return Finding("machine", "ok", detail)
+        return Finding("warn", detail, "provide shade and ventilation")
+    return Finding("ok", detail)
 
 
 def _celsius(file: Path) -> float:
@@ -313,20 +299,12 @@ def _output_of(program: str, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _device_error(name: str, error: BikepedError) -> Finding:
-    """A device that cannot be opened: only a warning while the running service may hold it."""
-    detail, remedy = _split(str(error))
-    if _output_of("systemctl", "is-active", "bikeped") == "active":
-        remedy = "the running service may hold it: systemctl stop bikeped"
-        return Finding(name, "warn", detail, remedy)
-    return Finding(name, "fail", detail, remedy)
+def _failed(error: BikepedError, *, device: bool = False) -> Finding:
+    """What is wrong and its remedy: a semicolon separates them in the message of an error.
 
-
-def _split(message: str) -> tuple[str, str]:
-    """What is wrong and its remedy: a semicolon separates them in the message of an error."""
-    detail, _, remedy = " ".join(message.split()).partition("; ")
-    return detail, remedy
-
-
-def _skip(name: str, option: str) -> Callable[[LoadedConfig], Finding]:
-    return lambda _loaded: Finding(name, "skipped", f"left out by {option}")
+    For a `device` only a warning while the running service may hold it.
+    """
+    detail, _, remedy = " ".join(str(error).split()).partition("; ")
+    if device and _output_of("systemctl", "is-active", "bikeped") == "active":
+        return Finding("warn", detail, "the running service may hold it: systemctl stop bikeped")
+    return Finding("fail", detail, remedy)

@@ -12,7 +12,7 @@ import pytest
 
 from bikeped.cli.main import main
 from bikeped.pipeline import doctor as checks
-from bikeped.pipeline.doctor import Check, Finding
+from bikeped.pipeline.doctor import Finding
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
 
@@ -131,15 +131,15 @@ def findings(monkeypatch):
     """Makes the doctor find what the test says."""
 
     def find(*found: Finding) -> None:
-        todo = tuple(Check(f.name, lambda loaded, f=f: f, 20) for f in found)
+        todo = tuple((f.name, lambda loaded, f=f: f, 20) for f in found)
         monkeypatch.setattr(checks, "checks", lambda **options: todo)
 
     return find
 
 
-FINE = Finding("camera", "ok", "30 frames/s [measured]")
-ODD = Finding("clock", "warn", "not synchronised", "timedatectl set-ntp true")
-BAD = Finding("model", "fail", "no such file", "name one")
+FINE = Finding("ok", "30 frames/s [measured]", name="camera")
+ODD = Finding("warn", "not synchronised", "timedatectl set-ntp true", "clock")
+BAD = Finding("fail", "no such file", "name one", "model")
 
 
 def test_doctor_says_what_to_do_and_fails_only_for_what_the_service_needs(

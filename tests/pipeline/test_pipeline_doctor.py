@@ -11,7 +11,7 @@ import pytest
 from bikeped.config.load import load_config
 from bikeped.errors import CaptureError, FeedbackError
 from bikeped.pipeline import doctor
-from bikeped.pipeline.doctor import Check, Finding, checks, run_checks
+from bikeped.pipeline.doctor import Finding, checks, run_checks
 from bikeped.types import Colour, Frame
 
 PATIENCE_S = 20.0
@@ -80,7 +80,7 @@ def test_a_slow_camera_is_a_warning(camera, small_config):
 
 
 def found_by(function, config, name="camera"):
-    (finding,) = run_checks(config, (Check(name, function, PATIENCE_S),))
+    (finding,) = run_checks(config, ((name, function, PATIENCE_S),))
     return finding
 
 
@@ -268,15 +268,15 @@ def test_a_check_that_hangs_or_breaks_does_not_end_the_others(small_config):
 
     def hangs(loaded):
         go.wait(PATIENCE_S)
-        return Finding("hangs", "ok", "late")
+        return Finding("ok", "late")
 
     def breaks(loaded):
         raise ZeroDivisionError("a bug")
 
     todo = (
-        Check("hangs", hangs, 0.01),
-        Check("breaks", breaks, PATIENCE_S),
-        Check("works", lambda loaded: Finding("works", "ok", "fine"), PATIENCE_S),
+        ("hangs", hangs, 0.01),
+        ("breaks", breaks, PATIENCE_S),
+        ("works", lambda loaded: Finding("ok", "fine"), PATIENCE_S),
     )
     try:
         found = list(run_checks(load_config(small_config()), todo))
@@ -292,7 +292,7 @@ def test_a_check_that_hangs_or_breaks_does_not_end_the_others(small_config):
 
 
 def test_all_that_was_promised_is_checked():
-    names = {check.name for check in checks()}
+    names = {name for name, _, _ in checks()}
     assert names >= {"configuration", "camera", "model", "light", "speaker", "broker", "clock"}
     assert names >= {"disk", "machine"}
-    assert all(check.limit_s > 0 for check in checks())
+    assert all(limit_s > 0 for _, _, limit_s in checks())

@@ -14,7 +14,7 @@ from pipeline_fakes import PATIENCE_S, FakeDetector, seen
 
 from bikeped.capture.base import FrameSource
 from bikeped.config.load import load_config
-from bikeped.pipeline.replay import ReplayFiles, replay
+from bikeped.pipeline.replay import replay
 from bikeped.types import Frame, Kind
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
@@ -82,9 +82,7 @@ async def test_a_broker_killed_in_mid_replay_costs_messages_and_no_time(
     )
     events = tmp_path / "events.jsonl"
     running = asyncio.create_task(
-        asyncio.to_thread(
-            replay, load_config(config), "endless", detector=Walker(), files=ReplayFiles(events)
-        )
+        asyncio.to_thread(replay, load_config(config), "endless", detector=Walker(), events=events)
     )
 
     def all_topics(received):

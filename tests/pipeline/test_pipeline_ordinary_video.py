@@ -14,7 +14,7 @@ import pytest
 from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config.load import load_config
-from bikeped.pipeline.replay import ReplayFiles, replay
+from bikeped.pipeline.replay import replay
 from bikeped.telemetry.builders import decision_digest
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +31,7 @@ def test_the_clip_has_a_walker_a_bicycle_and_cars_at_plausible_speeds(tmp_path):
     digests = []
     for run in range(2):
         events = tmp_path / f"{run}.jsonl"
-        result = replay(loaded, str(CLIP), files=ReplayFiles(events))
+        result = replay(loaded, str(CLIP), events=events)
         digests.append(decision_digest(events.read_bytes().splitlines()))
     assert digests[0] == digests[1]
 

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 from pipeline_fakes import FakeDetector, seen
 
+from bikeped.capture.base import FrameSource
 from bikeped.config.load import load_config
 from bikeped.errors import BikepedError, CaptureError, GeometryError, TelemetryError
-from bikeped.pipeline.replay import ReplayFiles, replay
+from bikeped.pipeline.replay import replay
 from bikeped.telemetry.builders import decision_digest, decision_view, parse_event
 from bikeped.types import Detections, Kind
 
@@ -37,7 +38,7 @@ def test_two_replays_decide_the_same_byte_for_byte(make_clip, small_config, tmp_
     digests, views = set(), set()
     for run in range(2):
         events = tmp_path / f"{run}.jsonl"
-        result = replay(loaded, str(clip), detector=Script(), files=ReplayFiles(events=events))
+        result = replay(loaded, str(clip), detector=Script(), events=events)
         assert result.frames == 45
         found = lines(events)
         assert len(found) == 46
@@ -54,13 +55,7 @@ def test_the_realtime_replay_decides_the_same(make_clip, small_config, tmp_path)
     views = []
     for run, realtime in enumerate((False, True)):
         events = tmp_path / f"{run}.jsonl"
-        replay(
-            loaded,
-            str(clip),
-            detector=Script(),
-            files=ReplayFiles(events=events),
-            realtime=realtime,
-        )
+        replay(loaded, str(clip), detector=Script(), events=events, realtime=realtime)
         # Paced frames carry the clock's time: the header and `t` agree to the tenth of a ms.
         views.append([decision_view(line) for line in lines(events)][1:])
     assert views[0] == views[1]
@@ -69,7 +64,7 @@ def test_the_realtime_replay_decides_the_same(make_clip, small_config, tmp_path)
 def test_a_real_model_decodes_detects_and_says_safe(make_clip, small_config, tmp_path):
     clip = make_clip("c.avi", 12)
     events, overlay = tmp_path / "e.jsonl", tmp_path / "o.mp4"
-    result = replay(load_config(small_config(clip)), str(clip), files=ReplayFiles(events, overlay))
+    result = replay(load_config(small_config(clip)), str(clip), events=events, overlay=overlay)
     summary = result.as_dict()
     assert summary["tracks"] == {"pedestrian": 1}
     assert summary["states"] == {"IDLE": 1, "SAFE": 11}  # a track counts from its second sight
@@ -97,9 +92,9 @@ def test_nothing_that_decodes_is_an_error_and_leaves_no_file(
     clip = make_clip("junk.avi", 3, [b"\xff\xd8\xff\xe0" + b"junk" * 50])
     out = tmp_path / "out"
     out.mkdir()
-    files = ReplayFiles(out / "e.jsonl", out / "o.mp4")
+    files = {"events": out / "e.jsonl", "overlay": out / "o.mp4"}
     with pytest.raises(BikepedError, match=r"junk\.avi"):
-        replay(load_config(small_config(clip)), str(clip), detector=FakeDetector(), files=files)
+        replay(load_config(small_config(clip)), str(clip), detector=FakeDetector(), **files)
     assert list(out.iterdir()) == []
 
 
@@ -114,10 +109,10 @@ def test_an_error_in_the_middle_leaves_no_half_written_file(
 
     out = tmp_path / "out"
     out.mkdir()
-    files = ReplayFiles(out / "e.jsonl", out / "o.mp4")
+    files = {"events": out / "e.jsonl", "overlay": out / "o.mp4"}
     clip = make_clip("c.avi", 10)
     with pytest.raises(CaptureError, match="went away"):
-        replay(load_config(small_config(clip)), str(clip), detector=Fails(), files=files)
+        replay(load_config(small_config(clip)), str(clip), detector=Fails(), **files)
     assert list(out.iterdir()) == []
 
 
@@ -139,7 +134,7 @@ def test_a_scaled_copy_is_said_once_with_the_remedy(make_clip, small_config, cap
     assert len(said) == 1
     assert "96 x 64" in said[0]
     assert "set camera.width" in said[0]
-    assert result.summary.warnings == said
+    assert result.warnings == said
     assert result.as_dict()["tracks"] == {"pedestrian": 1}  # the scale is right all the same
 
 
@@ -149,7 +144,7 @@ def test_detections_in_the_sky_mean_wrong_camera_settings(make_clip, small_confi
     with caplog.at_level(logging.WARNING):
         result = replay(loaded, str(clip))
     assert result.as_dict()["not_on_ground"] == 25
-    assert "pitch_deg" in result.summary.warnings[0]
+    assert "pitch_deg" in result.warnings[0]
     assert caplog.text.count("25 of 25 detections") == 1
 
 
@@ -157,7 +152,7 @@ def test_a_few_in_the_sky_mean_nothing(make_clip, small_config):
     clip = make_clip("c.avi", 25)
     detector = FakeDetector(seen((Kind.PEDESTRIAN, 48, 40), (Kind.PEDESTRIAN, 40, 45)))
     result = replay(load_config(small_config(clip)), str(clip), detector=detector)
-    assert result.summary.warnings == []
+    assert result.warnings == []
 
 
 def test_the_lamps_of_the_crossing_are_not_touched(make_clip, small_config, caplog):
@@ -171,8 +166,11 @@ def test_the_lamps_of_the_crossing_are_not_touched(make_clip, small_config, capl
 
 
 def test_a_camera_is_no_recording(small_config, monkeypatch):
-    class Camera:
+    class Camera(FrameSource):
         name, live = "/dev/video0", True
+
+        def read(self):
+            return None
 
         def close(self):
             pass
@@ -190,10 +188,10 @@ def test_without_a_model_the_key_is_named(make_clip, small_config):
 
 def test_an_event_file_that_cannot_be_written_stops_before_the_replay(make_clip, small_config):
     detector = FakeDetector(Detections.empty())
-    files = ReplayFiles(events=Path("/nowhere/e.jsonl"))
+    events = Path("/nowhere/e.jsonl")
     clip = make_clip("c.avi", 3)
     with pytest.raises(TelemetryError, match="/nowhere"):
-        replay(load_config(small_config(clip)), str(clip), detector=detector, files=files)
+        replay(load_config(small_config(clip)), str(clip), detector=detector, events=events)
     assert detector.calls == 0
 
 
@@ -209,7 +207,7 @@ def test_an_interrupt_ends_with_what_there_is_and_says_so(make_clip, small_confi
         load_config(small_config(clip)),
         str(clip),
         detector=Script(),
-        files=ReplayFiles(events=events),
+        events=events,
         progress=interrupt,
     )
     assert result.interrupted

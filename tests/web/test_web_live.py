@@ -405,7 +405,6 @@ def test_no_page_of_the_service_changes_what_it_decides(make_clip, small_config)
 
 def test_pages_change_no_decision(make_clip, small_config, tmp_path):
     """The same events, byte for byte, with a visitor and without."""
-    from bikeped.pipeline.replay import ReplayFiles
     from bikeped.telemetry.builders import decision_view
 
     clip = make_clip("c.avi", 20)
@@ -414,7 +413,7 @@ def test_pages_change_no_decision(make_clip, small_config, tmp_path):
         loaded = load_config(small_config(clip), ["web.enabled=true", "web.port=0"])
         events: Path = tmp_path / f"{run}.jsonl"
         pages = ServicePages(loaded) if run else None
-        replay(loaded, str(clip), files=ReplayFiles(events=events), pages=pages)
+        replay(loaded, str(clip), events=events, pages=pages)
         lines = events.read_bytes().splitlines()[1:]
         views.append([decision_view(line) for line in lines])
     assert views[0] == views[1]

@@ -21,7 +21,7 @@ from bikeped.config.load import load_config
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import Scenario, parse_scenario
-from bikeped.pipeline.replay import ReplayFiles, ReplayResult, replay
+from bikeped.pipeline.replay import ReplayResult, replay
 from bikeped.telemetry.builders import parse_event
 from bikeped.web.live import LivePage, add_live
 from bikeped.web.live_state import LiveState
@@ -99,7 +99,7 @@ class Running:
             self.loaded,
             str(self._clip),
             detector=self.detector,
-            files=ReplayFiles(events=self._events),
+            events=self._events,
             mqtt=False,
             pages=self.pages,
         )

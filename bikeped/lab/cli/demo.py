@@ -59,7 +59,7 @@ def command(
     from bikeped.lab.rendering.clip import frame_times, write_clip
     from bikeped.lab.scenarios.scenario import load_scenario
     from bikeped.models import BUNDLED, NOT_FOR_STREETS
-    from bikeped.pipeline.replay import ReplayFiles, replay
+    from bikeped.pipeline.replay import replay
     from bikeped.telemetry.http_server import port_error
 
     if web_place is not None:
@@ -90,7 +90,8 @@ def command(
             loaded,
             str(clip),
             own_camera=True,
-            files=ReplayFiles(events, overlay),
+            events=events,
+            overlay=overlay,
             realtime=pages is not None,
             mqtt=False,
             progress=progress,
