@@ -54,42 +54,29 @@ _TYPES: dict[str, np.dtype[Any]] = {
 
 
 class Cuda:
-    """A stream and its buffers."""
+    """A stream and its buffers, which live as long as the process."""
 
     def __init__(self, library: Any = None) -> None:
         """`library` stands in for libcudart in tests. Raises `DetectorError` without CUDA."""
         self._library = library if library is not None else _load()
-        self._host: list[ctypes.c_void_p] = []
-        self._device: list[ctypes.c_void_p] = []
-        stream = ctypes.c_void_p()
-        self._call("cudaStreamCreate", ctypes.byref(stream))
-        self._stream: ctypes.c_void_p | None = stream
+        self._stream = ctypes.c_void_p()
+        self._call("cudaStreamCreate", ctypes.byref(self._stream))
 
     @property
     def stream(self) -> int:
         """The stream's handle as TensorRT takes it."""
-        return (self._stream.value if self._stream else 0) or 0
+        return self._stream.value or 0
 
-    def device(self, size: int) -> int:
-        """Address of `size` bytes on the GPU."""
-        address = ctypes.c_void_p()
-        self._call("cudaMalloc", ctypes.byref(address), ctypes.c_size_t(max(size, 1)))
-        self._device.append(address)
-        return address.value or 0
-
-    def host(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-        """A zeroed array in page-locked memory: copies from it need no staging.
-
-        It must not be used after `close`.
-        """
+    def tensor(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[npt.NDArray[Any], int]:
+        """A zeroed array in page-locked memory (copies need no staging); its address on the GPU."""
         size = max(int(np.prod(shape)) * dtype.itemsize, 1)
-        address = ctypes.c_void_p()
-        self._call("cudaHostAlloc", ctypes.byref(address), ctypes.c_size_t(size), ctypes.c_uint(0))
-        self._host.append(address)
-        memory = (ctypes.c_ubyte * size).from_address(address.value or 0)
+        host, device = ctypes.c_void_p(), ctypes.c_void_p()
+        self._call("cudaHostAlloc", ctypes.byref(host), ctypes.c_size_t(size), ctypes.c_uint(0))
+        self._call("cudaMalloc", ctypes.byref(device), ctypes.c_size_t(size))
+        memory = (ctypes.c_ubyte * size).from_address(host.value or 0)
         array: npt.NDArray[Any] = np.ndarray(shape, dtype, buffer=memoryview(memory))
         array[...] = 0
-        return array
+        return array, device.value or 0
 
     def upload(self, device: int, array: npt.NDArray[Any]) -> None:
         """Queues a copy of a contiguous `array` to the GPU."""
@@ -102,16 +89,6 @@ class Cuda:
     def synchronize(self) -> None:
         """Waits until all queued work is done."""
         self._call("cudaStreamSynchronize", self._stream)
-
-    def close(self) -> None:
-        """Frees stream and buffers; a second call does nothing."""
-        for address in self._device:
-            self._library.cudaFree(address)
-        for address in self._host:
-            self._library.cudaFreeHost(address)
-        if self._stream is not None:
-            self._library.cudaStreamDestroy(self._stream)
-        self._device, self._host, self._stream = [], [], None
 
     def _copy(self, to: int, origin: int, size: int, kind: int) -> None:
         addresses = ctypes.c_void_p(to), ctypes.c_void_p(origin)
@@ -219,9 +196,7 @@ class EngineBackend:
             raise DetectorError(
                 f"{self._source}: the engine refuses input {list(size)}; build it for this shape"
             )
-        array = self._cuda.host(size, dtype)
-        self._input_address = self._cuda.device(array.nbytes)
-        self._address(name, self._input_address)
+        array, self._input_address = self._bind(name, size, dtype)
         return array
 
     def _bind_output(self, name: str) -> tuple[str, npt.NDArray[Any], int]:
@@ -231,14 +206,15 @@ class EngineBackend:
                 f"{self._source}: output {name} has no fixed shape {list(shape)}; export without "
                 "data-dependent outputs"
             )
-        array = self._cuda.host(shape, self._dtype(name))
-        address = self._cuda.device(array.nbytes)
-        self._address(name, address)
-        return name, array, address
+        return name, *self._bind(name, shape, self._dtype(name))
 
-    def _address(self, name: str, address: int) -> None:
+    def _bind(
+        self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]
+    ) -> tuple[npt.NDArray[Any], int]:
+        array, address = self._cuda.tensor(shape, dtype)
         if not self._context.set_tensor_address(name, address):
             raise DetectorError(f"{self._source}: TensorRT refuses the buffer of {name}")
+        return array, address
 
     def _dtype(self, name: str) -> np.dtype[Any]:
         kind = self._engine.get_tensor_dtype(name)

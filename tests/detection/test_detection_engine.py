@@ -50,7 +50,6 @@ class Library:
 
     def __init__(self):
         self.memory = {}
-        self.freed = []
         self.fail = {}
 
     def _allocate(self, out, size):
@@ -80,16 +79,6 @@ class Library:
 
     def cudaStreamSynchronize(self, stream):  # noqa: N802
         return self.fail.get("cudaStreamSynchronize", 0)
-
-    def cudaFree(self, address):  # noqa: N802
-        self.freed.append(self.memory.pop(address.value))
-        return 0
-
-    cudaFreeHost = cudaFree  # noqa: N815
-
-    def cudaStreamDestroy(self, stream):  # noqa: N802
-        self.freed.append(stream.value)
-        return 0
 
     def cudaGetErrorString(self, status):  # noqa: N802
         return b"out of memory"
@@ -290,17 +279,6 @@ def test_an_engine_of_yolox_asks_for_its_preprocessing(world, tmp_path):
     with pytest.raises(DetectorError, match=r"set detection\.preprocess"):
         load(path)
     assert load(path, preprocess="yolox").layout == "yolox"
-
-
-def test_buffers_are_freed_once():
-    library = Library()
-    cuda = Cuda(library)
-    cuda.device(10)
-    cuda.host((2, 3), np.dtype(np.float32))
-    cuda.close()
-    cuda.close()
-    assert library.memory == {}
-    assert len(library.freed) == 3
 
 
 @given(st.binary(max_size=64))
