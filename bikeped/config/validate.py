@@ -34,25 +34,17 @@ def to_config(data: dict[str, Any], source: str) -> Config:
 def check_together(config: Config, source: str) -> None:
     """Checks keys that depend on one another; ConfigError as `to_config`."""
     camera, mqtt, web = config.camera, config.mqtt, config.web
-    if camera.calibration is None and (camera.radius_px is None) != (camera.fov_deg is None):
-        raise ConfigError(
-            f"{source}: camera.radius_px and camera.fov_deg: without a calibration both are "
-            "needed, for they give the focal length; set both"
-        )
-    if camera.calibration is None and camera.radius_px is None:
-        raise ConfigError(
-            f"{source}: camera.calibration: missing; name a calibration file, or set "
-            "camera.radius_px and camera.fov_deg"
-        )
-    if (mqtt.cert_file is None) != (mqtt.key_file is None):
-        raise ConfigError(
-            f"{source}: mqtt.cert_file and mqtt.key_file: one without the other; set both"
-        )
-    if web.enabled and web.token_file is None and not is_loopback(web.host):
-        raise ConfigError(
-            f"{source}: web.host: {one_line(web.host)} can be reached by others, who would see the "
-            "camera's picture; set web.token_file too, or web.host: 127.0.0.1"
-        )
+    if camera.calibration is None and None in (camera.radius_px, camera.fov_deg):
+        problem = "camera.calibration: missing; name a calibration file, or set both "
+        problem += "camera.radius_px and camera.fov_deg"
+    elif (mqtt.cert_file is None) != (mqtt.key_file is None):
+        problem = "mqtt.cert_file and mqtt.key_file: one without the other; set both"
+    elif web.enabled and web.token_file is None and not is_loopback(web.host):
+        problem = f"web.host: {one_line(web.host)} can be reached by others, who would see the "
+        problem += "camera's picture; set web.token_file too, or web.host: 127.0.0.1"
+    else:
+        return
+    raise ConfigError(f"{source}: {problem}")
 
 
 def known_keys() -> Iterator[str]:

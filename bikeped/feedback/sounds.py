@@ -14,7 +14,6 @@ import wave
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bikeped.errors import FeedbackError
 from bikeped.types import FloatArray, Sound
@@ -48,25 +47,40 @@ _ATTACK_S = 0.002
 _FADE_S = 0.03
 
 
-def chime() -> FloatArray:
-    """The chime at `RATE_HZ`, samples in -1..1, peak 1."""
-    return _struck(_CHIME_NOTES_HZ, _CHIME_PARTIALS, _CHIME_SPACING_S, _CHIME_S)
+#: Of each sound: its notes in Hz, their partials, the seconds between them, and its length.
+_SOUNDS = {
+    Sound.CHIME: (_CHIME_NOTES_HZ, _CHIME_PARTIALS, _CHIME_SPACING_S, _CHIME_S),
+    Sound.BELL: ((_BELL_PRIME_HZ, _BELL_PRIME_HZ), _BELL_PARTIALS, _BELL_SPACING_S, _BELL_S),
+}
 
 
-def bell() -> FloatArray:
-    """The bell, struck twice, at `RATE_HZ`, samples in -1..1, peak 1."""
-    return _struck((_BELL_PRIME_HZ,) * 2, _BELL_PARTIALS, _BELL_SPACING_S, _BELL_S)
+def synthesise(sound: Sound) -> FloatArray:
+    """The chime or the bell at `RATE_HZ`, samples in -1..1, peak 1; KeyError for `Sound.NONE`.
+
+    Each note rings to the end, which fades out.
+    """
+    notes_hz, partials, spacing_s, length_s = _SOUNDS[sound]
+    out = np.zeros(round(length_s * RATE_HZ))
+    for index, note_hz in enumerate(notes_hz):
+        start = round(index * spacing_s * RATE_HZ)
+        t = np.arange(out.size - start) / RATE_HZ
+        # A few milliseconds of attack: a step at the start would click.
+        attack = np.minimum(t / _ATTACK_S, 1.0)
+        for ratio, amplitude, decay_s in partials:
+            wave_form = np.sin(2 * np.pi * note_hz * ratio * t)
+            out[start:] += amplitude * np.exp(-t / decay_s) * attack * wave_form
+    fade = round(_FADE_S * RATE_HZ)
+    out[-fade:] *= np.linspace(1.0, 0.0, fade)
+    scaled: FloatArray = out / float(np.abs(out).max())
+    return scaled
 
 
 def make_wav(sound: Sound, volume: float) -> bytes:
     """bikeped's own `sound` as a WAV file: 48 kHz, 16 bit, mono; `volume` 0 (silent) to 1 (full).
 
-    Raises ValueError for `Sound.NONE` and for a volume outside 0..1.
+    Raises KeyError for `Sound.NONE`.
     """
-    if sound is Sound.NONE:
-        raise ValueError("Sound.NONE has no samples")
-    samples = chime() if sound is Sound.CHIME else bell()
-    return encode_wav(np.round(samples * 32767 * _checked(volume)).astype("<i2"), RATE_HZ, 1)
+    return encode_wav(synthesise(sound) * 32767 * volume, RATE_HZ, 1)
 
 
 def load_wav(path: Path, key: str, volume: float) -> bytes:
@@ -95,19 +109,17 @@ def load_wav(path: Path, key: str, volume: float) -> bytes:
             f"{MAX_DURATION_S:g} s"
         )
     whole = len(data) - len(data) % (2 * channels)
-    samples = np.frombuffer(data[:whole], "<i2")
-    scaled = np.round(samples.astype(np.float64) * _checked(volume)).astype("<i2")
-    return encode_wav(scaled, rate_hz, channels)
+    return encode_wav(np.frombuffer(data[:whole], "<i2") * volume, rate_hz, channels)
 
 
-def encode_wav(samples: npt.NDArray[np.int16], rate_hz: int, channels: int) -> bytes:
-    """16-bit samples (interleaved when stereo) as the bytes of a WAV file."""
+def encode_wav(samples: FloatArray, rate_hz: int, channels: int) -> bytes:
+    """Samples of +-32767 (interleaved when stereo) as the bytes of a 16-bit WAV file."""
     buffer = io.BytesIO()
     with wave.open(buffer, "wb") as file:
         file.setnchannels(channels)
         file.setsampwidth(2)
         file.setframerate(rate_hz)
-        file.writeframes(samples.tobytes())
+        file.writeframes(np.round(samples).astype("<i2").tobytes())
     return buffer.getvalue()
 
 
@@ -115,31 +127,3 @@ def duration_s(wav: bytes) -> float:
     """How long a WAV file made here plays, seconds."""
     with wave.open(io.BytesIO(wav), "rb") as file:
         return file.getnframes() / file.getframerate()
-
-
-def _checked(volume: float) -> float:
-    if not 0 <= volume <= 1:
-        raise ValueError(f"expected a volume in 0..1, got {volume}")
-    return volume
-
-
-def _struck(
-    notes_hz: tuple[float, ...],
-    partials: tuple[tuple[float, float, float], ...],
-    spacing_s: float,
-    length_s: float,
-) -> FloatArray:
-    """Notes struck `spacing_s` apart, each ringing to the end, which fades out; peak 1."""
-    out = np.zeros(round(length_s * RATE_HZ))
-    for index, note_hz in enumerate(notes_hz):
-        start = round(index * spacing_s * RATE_HZ)
-        t = np.arange(out.size - start) / RATE_HZ
-        # A few milliseconds of attack: a step at the start would click.
-        attack = np.minimum(t / _ATTACK_S, 1.0)
-        for ratio, amplitude, decay_s in partials:
-            wave_form = np.sin(2 * np.pi * note_hz * ratio * t)
-            out[start:] += amplitude * np.exp(-t / decay_s) * attack * wave_form
-    fade = round(_FADE_S * RATE_HZ)
-    out[-fade:] *= np.linspace(1.0, 0.0, fade)
-    scaled: FloatArray = out / float(np.abs(out).max())
-    return scaled

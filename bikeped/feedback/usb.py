@@ -47,8 +47,12 @@ _RGB: dict[Colour, tuple[int, int, int]] = {
     Colour.RED: (255, 0, 0),
 }
 
-_IDS = {"blink1": (0x27B8, 0x01ED), "luxafor": (0x04D8, 0xF372), "relay": (0x16C0, 0x05DF)}
-_NAMES = {"blink1": "blink(1)", "luxafor": "Luxafor Flag", "relay": "HID relay board"}
+#: Name, vendor and product of each kind of device.
+_DEVICES = {
+    "blink1": ("blink(1)", 0x27B8, 0x01ED),
+    "luxafor": ("Luxafor Flag", 0x04D8, 0xF372),
+    "relay": ("HID relay board", 0x16C0, 0x05DF),
+}
 
 
 def relay_lamps(config: UsbConfig) -> dict[Colour, Lamp]:
@@ -64,8 +68,8 @@ class UsbLight:
     """
 
     def __init__(self, config: UsbConfig, *, backend: Any = None) -> None:
-        vendor, product = _IDS[config.device]
-        self._name = f"{_NAMES[config.device]} {vendor:04x}:{product:04x}"
+        name, vendor, product = _DEVICES[config.device]
+        self._name = f"{name} {vendor:04x}:{product:04x}"
         self._core, self._util = _load_pyusb()
         lamps = relay_lamps(config) if config.device == "relay" else {}
         with self._errors("cannot be opened"):
@@ -92,7 +96,7 @@ class UsbLight:
 
     def _find(self, config: UsbConfig, backend: Any) -> Any:
         """The one device that fits kind and serial number."""
-        vendor, product = _IDS[config.device]
+        _, vendor, product = _DEVICES[config.device]
         other_devices: list[str] = []
         devices = self._core.find(
             find_all=True, idVendor=vendor, idProduct=product, backend=backend
@@ -119,8 +123,7 @@ class UsbLight:
             return str(device.serial_number)
         # The board's USB serial number is the same on all of them; its own is in the report.
         _detach(device)
-        report = _get_feature(device, 0, 8)
-        return bytes(report[:5]).rstrip(b"\0").decode("ascii", "replace")
+        return _relay_report(device)[:5].rstrip(b"\0").decode("ascii", "replace")
 
     def _protocol(self, config: UsbConfig, lamps: dict[Colour, Lamp]) -> Callable[[Colour], object]:
         """What shows a colour on this kind of device."""
@@ -167,24 +170,24 @@ def _show_by_relays(device: Any, relays: dict[Colour, int], colour: Colour) -> N
 
     Only relays that must change are switched, for mechanical ones wear.
     """
-    lamp, wired = relays.get(colour), sorted(set(relays.values()))
-    state = int(_get_feature(device, 0, 8)[7])
+    wanted = {relays[colour]} if colour in relays else set()
+    wired = set(relays.values())
     # The dark ones first, so two lamps never show at once.
-    for relay in sorted(wired, key=lambda relay: relay == lamp):
-        if bool(state & _bit(relay)) != (relay == lamp):
-            command = 0xFF if relay == lamp else 0xFD
-            _set_feature(device, 0, bytes([command, relay, 0, 0, 0, 0, 0, 0]))
-    wanted = 0 if lamp is None else _bit(lamp)
-    got = int(_get_feature(device, 0, 8)[7]) & sum(map(_bit, wired))
+    to_switch = (_closed_relays(device) & wired) ^ wanted
+    for relay in sorted(to_switch, key=lambda relay: (relay in wanted, relay)):
+        command = 0xFF if relay in wanted else 0xFD
+        _set_feature(device, 0, bytes([command, relay, 0, 0, 0, 0, 0, 0]))
+    got = _closed_relays(device) & wired
     if got != wanted:
         raise FeedbackError(
-            f"{SECTION}: the relay board does not obey: relays {wanted:08b} were asked for, "
-            f"{got:08b} are on; does the board have as many relays as relay_* names?"
+            f"{SECTION}: the relay board does not obey: relays {sorted(wanted)} were asked for, "
+            f"{sorted(got)} are on; does the board have as many relays as relay_* names?"
         )
 
 
-def _bit(relay: int) -> int:
-    return 1 << (relay - 1)
+def _closed_relays(device: Any) -> set[int]:
+    bits = _relay_report(device)[7]
+    return {relay for relay in range(1, 9) if bits >> (relay - 1) & 1}
 
 
 def _set_feature(device: Any, report_id: int, data: bytes) -> None:
@@ -196,14 +199,13 @@ def _set_feature(device: Any, report_id: int, data: bytes) -> None:
         raise FeedbackError(f"{SECTION}: only {sent} of {len(data)} bytes were taken")
 
 
-def _get_feature(device: Any, report_id: int, length: int) -> Any:
-    value = (_FEATURE << 8) | report_id
+def _relay_report(device: Any) -> bytes:
     report = device.ctrl_transfer(
-        _CLASS_INTERFACE_IN, _GET_REPORT, value, _INTERFACE, length, TIMEOUT_MS
+        _CLASS_INTERFACE_IN, _GET_REPORT, _FEATURE << 8, _INTERFACE, 8, TIMEOUT_MS
     )
-    if len(report) != length:
-        raise FeedbackError(f"{SECTION}: a report of {length} bytes came with {len(report)}")
-    return report
+    if len(report) != 8:
+        raise FeedbackError(f"{SECTION}: a report of 8 bytes came with {len(report)}")
+    return bytes(report)
 
 
 def _detach(device: Any) -> None:

@@ -336,7 +336,7 @@ def test_what_no_single_key_can_say():
     line = refusal(NO_FILE + "decision: {d_min_m: 9, d_max_m: 8}\n")
     assert "decision.d_min_m: 9 is above decision.d_max_m 8" in line
     assert "camera.calibration: missing" in refusal("")
-    assert "without a calibration both" in refusal("camera: {radius_px: 1750}\n")
+    assert "set both camera.radius_px" in refusal("camera: {radius_px: 1750}\n")
     assert "mqtt.cert_file and mqtt.key_file" in refusal(NO_FILE + "mqtt: {cert_file: a.pem}\n")
 
 

@@ -247,7 +247,7 @@ def test_a_board_that_does_not_obey_is_an_error() -> None:
     device.relay_count = 2
     light = relays(device)
     light.set(Colour.RED)
-    with pytest.raises(FeedbackError, match=r"does not obey.*00000100 were asked for"):
+    with pytest.raises(FeedbackError, match=r"does not obey.*\[3\] were asked for, \[\] are on"):
         light.set(Colour.GREEN)
     assert device.relays == 0
 
