@@ -31,7 +31,7 @@ from bikeped import __version__
 from bikeped.config.build import road_region
 from bikeped.config.load import LoadedConfig, load_config
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector, sha256_of
+from bikeped.detection.detector import load_detector, sha256_of
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.rendering.dataset import DEFAULT_MIX
 from bikeped.lab.training.augment import AugmentSettings, augment_data

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bikeped.detection.base import DetectionResult
+from bikeped.detection.detector import DetectionResult
 from bikeped.lab.rendering import DrawnObject
 from bikeped.lab.rendering.clip import read_sidecar
 from bikeped.pipeline.detection_scheduler import DecodedFrame

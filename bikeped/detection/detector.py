@@ -1,4 +1,4 @@
-"""The detector around a network: preprocessing, inference, decoding, suppression, riders.
+"""The detector around a network: preprocessing, inference, decoding, suppression, riders; loading.
 
 A runtime (ONNX Runtime, TensorRT) is a `Backend`: it owns the input array and returns output
 arrays. Everything else is common to both and lives in the pure modules of this package.
@@ -6,9 +6,11 @@ arrays. Everything else is common to both and lives in the pure modules of this 
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import DetectionResult
 from bikeped.detection.model_metadata import (
     UNMAPPED,
     ModelMetadata,
@@ -29,6 +30,7 @@ from bikeped.detection.output_layouts import Candidates, Layout, choose_layout, 
 from bikeped.detection.person_boxes import join_riders, suppress_partial_person_boxes
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.errors import DetectorError
+from bikeped.models import model_file
 from bikeped.types import (
     BoolArray,
     Detections,
@@ -46,6 +48,17 @@ log = logging.getLogger(__name__)
 RIDDEN_CONFIDENCE_SHARE = 0.5
 #: Suppression takes at most this many candidates, the strongest: it bounds its time.
 MAX_CANDIDATES = 4096
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class DetectionResult:
+    """Detections in one frame, and the time that each stage took, in milliseconds."""
+
+    detections: Detections
+    pre_ms: float
+    inference_ms: float
+    post_ms: float
 
 
 class Backend(Protocol):
@@ -73,8 +86,8 @@ class Backend(Protocol):
         """
 
 
-class NetworkDetector:
-    """A `Detector` around a backend."""
+class Detector:
+    """Detects road users in frames. For one thread at a time: buffers are reused."""
 
     def __init__(
         self, path: Path, config: DetectionConfig, model_hash: str, backend: Backend
@@ -83,9 +96,9 @@ class NetworkDetector:
         self._backend = backend
         self._config = config
         self._source = str(path)
-        self.model_hash = model_hash
+        self.model_hash = model_hash  #: SHA-256 of the model file, lower-case hexadecimal
         height, width = backend.buffer.shape[2:]
-        self.input_size = (int(width), int(height))
+        self.input_size = (int(width), int(height))  #: pixels
         metadata = backend.metadata
         backend.buffer[...] = PAD if backend.buffer.dtype == np.uint8 else PAD / 255
         outputs = backend.run()
@@ -100,6 +113,7 @@ class NetworkDetector:
         self.class_names: tuple[str, ...] = names  #: of the network's own classes, by their number
         self._kind_of_class = kind_table(names, config, self._source)
         self._wanted = self._kind_of_class != UNMAPPED
+        #: Whether a cyclist's box holds the rider, too, who is then no pedestrian beside it.
         self.cyclist_box_includes_rider = cyclist_classes_include_riders(names, self._kind_of_class)
         self._rider_overlap = 1.0 if self.cyclist_box_includes_rider else config.rider_overlap
         share = RIDDEN_CONFIDENCE_SHARE if self._rider_overlap < 1 else 1.0
@@ -131,7 +145,10 @@ class NetworkDetector:
         return f"{Path(self._source).name} ({self._backend.description})"
 
     def decode_size(self, frame_width: int, frame_height: int) -> tuple[int, int]:
-        """The size of the whole frame at the scale of the network's input, at most its own size."""
+        """Smallest decoded width and height that lose nothing against the full frame.
+
+        A JPEG decoder may use any reduced scale that is not smaller than this.
+        """
         box = self._preprocess.letterbox(frame_width, frame_height)
         x1, y1, x2, y2 = box.shown_px
         # Rounded down: one pixel more could need the next larger JPEG scale, at twice the time.
@@ -140,7 +157,13 @@ class NetworkDetector:
         return min(wide, frame_width), min(high, frame_height)
 
     def infer(self, rgb: ImageArray, frame_width: int, frame_height: int) -> DetectionResult:
-        """See `Detector.infer`."""
+        """Detections in `rgb` [h, w, 3] uint8, a frame decoded at any scale.
+
+        Boxes are in pixels of the full frame of `frame_width` x `frame_height`, clipped to it; most
+        confident first, equal confidences in the network's order (deterministic). Raises
+        `DetectorError` where the network fails or returns no numbers, and `ValueError` for an image
+        of another aspect ratio than the frame's.
+        """
         start = time.perf_counter()
         letterbox = self._preprocess(rgb, frame_width, frame_height)
         filled = time.perf_counter()
@@ -266,3 +289,60 @@ def _family(
     family: Family = "yolox" if on_bytes else "yolox-legacy"
     input_range = "0..255" if on_bytes else "normalised input"
     return family, f"first convolution's gain {gain:.3g} is that of {input_range}"
+
+
+def sha256_of(path: Path, expected: str | None = None) -> str:
+    """The file's SHA-256 in lower-case hexadecimal, read in chunks of 1 MiB.
+
+    Raises `DetectorError` where the file cannot be read or is not `expected`, `detection.sha256`.
+    """
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while chunk := file.read(_CHUNK):
+                digest.update(chunk)
+    except FileNotFoundError:
+        raise DetectorError(
+            f"{path}: no such model file; correct detection.model or put the file there"
+        ) from None
+    except OSError as error:
+        raise DetectorError(f"{path}: cannot read the model file: {error.strerror}") from error
+    actual = digest.hexdigest()
+    if expected is not None and expected.lower() != actual:
+        raise DetectorError(
+            f"{path}: SHA-256 is {actual} but detection.sha256 expects {expected.lower()}; "
+            "put the right model there or correct detection.sha256"
+        )
+    return actual
+
+
+def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None = None) -> Detector:
+    """The detector of the section `detection`, warmed up.
+
+    A relative `detection.model` starts from `base_dir`; `bundled` is the model that comes with
+    bikeped, with 8-bit weights on a CPU. `road` is the part of the frames in which road users can
+    appear, for `detection.region`; None: the whole frame. Raises `DetectorError` where there is no
+    model, its hash differs, it cannot be run, or its output layout is unknown.
+    """
+    if config.model is None:
+        raise DetectorError(
+            "detection.model: no model is configured; name an .onnx or .engine file, or bundled"
+        )
+    path = model_file(config.model, base_dir)
+    # Imported where needed: an .engine does not need onnxruntime, nor an .onnx file tensorrt.
+    if path.suffix.lower() == ".onnx":
+        from bikeped.detection.onnx_runtime import OnnxBackend, runs_on_cpu
+
+        path = model_file(config.model, base_dir, on_cpu=runs_on_cpu(config.providers))
+        digest = sha256_of(path, config.sha256)
+        backend: Backend = OnnxBackend(path, config, digest, road)
+    elif path.suffix.lower() == ".engine":
+        from bikeped.detection.trt_engine import EngineBackend
+
+        digest = sha256_of(path, config.sha256)
+        backend = EngineBackend(path, config, road)
+    else:
+        raise DetectorError(
+            f"detection.model: {path} is neither .onnx nor .engine; export the model to one of them"
+        )
+    return Detector(path, config, digest, backend)

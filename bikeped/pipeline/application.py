@@ -17,7 +17,7 @@ from bikeped import __version__
 from bikeped.config.build import road_region
 from bikeped.config.load import LoadedConfig
 from bikeped.cores import cores
-from bikeped.detection.base import load_detector
+from bikeped.detection.detector import load_detector
 from bikeped.errors import DetectorError
 from bikeped.feedback.light import LightDriver
 from bikeped.feedback.signal_logic import SignalLogic

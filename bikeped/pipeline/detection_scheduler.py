@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from bikeped.capture.jpeg import JpegDecoder
-from bikeped.detection.base import DetectionResult, Detector
+from bikeped.detection.detector import DetectionResult, Detector
 from bikeped.errors import BikepedError, CaptureError, GeometryError
 from bikeped.pipeline.fault_monitor import FaultMonitor
 from bikeped.pipeline.feed import Feed

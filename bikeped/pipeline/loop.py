@@ -21,7 +21,7 @@ from typing import Protocol
 
 import numpy as np
 
-from bikeped.detection.base import DetectionResult
+from bikeped.detection.detector import DetectionResult
 from bikeped.faults import Fault
 from bikeped.overlay.overlay_data import GroundToFrame, OverlayData, ground_projector
 from bikeped.pipeline.detection_scheduler import (

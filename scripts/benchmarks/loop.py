@@ -16,7 +16,7 @@ import onnxruntime as ort
 from benchmarks.figures import Figures
 from bikeped.config.load import LoadedConfig, load_config
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector
+from bikeped.detection.detector import load_detector
 from bikeped.lab.demo.summary import bundled_scenario
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import AviWriter, encode_jpeg

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bikeped.config.load import LoadedConfig, load_config
-from bikeped.detection.base import DetectionResult
+from bikeped.detection.detector import DetectionResult
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.clip import read_sidecar, sidecar_path, write_clip
 from bikeped.lab.scenarios.scenario import parse_scenario

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from bikeped.config.schema import DetectionConfig
 from bikeped.detection import trt_engine as engine_module
-from bikeped.detection.base import load_detector
+from bikeped.detection.detector import load_detector
 from bikeped.detection.trt_engine import Cuda, split_header
 from bikeped.errors import DetectorError
 from bikeped.types import Kind

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import sha256_of
+from bikeped.detection.detector import sha256_of
 from bikeped.detection.model_metadata import (
     COCO_NAMES,
     ModelMetadata,

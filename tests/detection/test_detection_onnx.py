@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector
+from bikeped.detection.detector import load_detector
 from bikeped.detection.onnx_runtime import _options, choose_providers, runs_on_cpu
 from bikeped.errors import DetectorError
 from bikeped.types import Kind, Region

@@ -16,7 +16,7 @@ from onnx import helper, numpy_helper
 from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector
+from bikeped.detection.detector import load_detector
 from bikeped.detection.weights import first_gain, trained_on_bytes
 from bikeped.types import Kind
 

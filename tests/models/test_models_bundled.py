@@ -12,7 +12,7 @@ from bikeped.cli.main import main
 from bikeped.config.build import road_region
 from bikeped.config.load import load_config
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector, sha256_of
+from bikeped.detection.detector import load_detector, sha256_of
 from bikeped.lab.rendering import ScenePainter, scene_camera
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenario
 from bikeped.lab.training.model_card import meets_target, render_card

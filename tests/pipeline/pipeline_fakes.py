@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bikeped.config.load import LoadedConfig, parse_config
-from bikeped.detection.base import DetectionResult
+from bikeped.detection.detector import DetectionResult
 from bikeped.faults import Fault, fault_texts
 from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.pipeline.detection_scheduler import DecodedFrame, DetectionStage

@@ -10,7 +10,7 @@ import pytest
 from pipeline_fakes import PATIENCE_S, FakeDetector, Rig, seen, small
 
 import bikeped.pipeline.detection_scheduler as scheduler_module
-from bikeped.detection.base import DetectionResult
+from bikeped.detection.detector import DetectionResult
 from bikeped.errors import CaptureError, DetectorError, GeometryError
 from bikeped.pipeline.detection_scheduler import DecodedFrame, LatestFrameSlot
 from bikeped.pipeline.fault_monitor import RESTART_AFTER_S, Limits, StageHangError

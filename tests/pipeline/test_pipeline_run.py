@@ -173,7 +173,7 @@ def test_what_needs_a_person_ends_with_2_and_one_line(start, small_config, optio
 HANGS = """
 import sys, threading
 from bikeped.cli.main import main
-from bikeped.detection.base import DetectionResult
+from bikeped.detection.detector import DetectionResult
 from bikeped.types import Detections
 import bikeped.pipeline.run as run
 

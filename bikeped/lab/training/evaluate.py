@@ -29,8 +29,7 @@ import numpy as np
 
 from bikeped import __version__
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector
-from bikeped.detection.detector import NetworkDetector
+from bikeped.detection.detector import Detector, load_detector
 from bikeped.detection.nms import non_max_suppression
 from bikeped.detection.output_layouts import Candidates
 from bikeped.errors import DataSetError, require
@@ -71,7 +70,7 @@ class ModelUnderTest:
 
     label: str
     path: Path
-    detector: NetworkDetector
+    detector: Detector
 
 
 @dataclass(frozen=True)
@@ -135,10 +134,7 @@ def load_models(
     models = []
     for label, path in named:
         config = msgspec.structs.replace(detection, model=str(path.absolute()), sha256=None)
-        detector = load_detector(config, Path())
-        if not isinstance(detector, NetworkDetector):
-            raise DataSetError(f"{path}: its classes cannot be read; name an .onnx or .engine file")
-        models.append(ModelUnderTest(label, path, detector))
+        models.append(ModelUnderTest(label, path, load_detector(config, Path())))
     return models
 
 

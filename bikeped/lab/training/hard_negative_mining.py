@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector
+from bikeped.detection.detector import load_detector
 from bikeped.geometry.boxes import iou_matrix
 from bikeped.lab.process_pool import worker_pool
 from bikeped.lab.training.coco import FALSE_POSITIVE, CocoData, CocoImage, furniture

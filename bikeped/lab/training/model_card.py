@@ -19,7 +19,7 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import Detector, load_detector
+from bikeped.detection.detector import Detector, load_detector
 from bikeped.geometry.boxes import iou_matrix
 from bikeped.geometry.framing import road_region
 from bikeped.lab.process_pool import worker_pool

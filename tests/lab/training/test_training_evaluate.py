@@ -12,7 +12,7 @@ from coco_sets import CATEGORIES, annotation, edit, write_set
 from shared_inputs import CLIP, MODEL, missing
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.detector import NetworkDetector
+from bikeped.detection.detector import Detector
 from bikeped.detection.model_metadata import ModelMetadata
 from bikeped.errors import DataSetError, DetectorError
 from bikeped.lab.rendering.dataset import write_dataset
@@ -49,7 +49,7 @@ class Told:
 
 
 def model(*pictures, label="told", config=CPU):
-    detector = NetworkDetector(Path("told.onnx"), config, "0" * 64, Told(*pictures))
+    detector = Detector(Path("told.onnx"), config, "0" * 64, Told(*pictures))
     return ModelUnderTest(label, Path("told.onnx"), detector)
 
 
@@ -211,7 +211,7 @@ def test_drawn_scenes_are_read_and_judged_by_distance(tmp_path):
     network.metadata = ModelMetadata(
         names=("pedestrian", "cyclist", "vehicle"), end_to_end=True, ultralytics=True
     )
-    detector = NetworkDetector(Path("told.onnx"), CPU, "0" * 64, network)
+    detector = Detector(Path("told.onnx"), CPU, "0" * 64, network)
     result = evaluate(data, [ModelUnderTest("told", Path("told.onnx"), detector)], CPU, ONE)
     (score,) = result.scores
     assert score.classes.overall.ar > 0.9  # boxes of a few pixels are rounded

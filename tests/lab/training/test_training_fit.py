@@ -12,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
 from bikeped.config.schema import DetectionConfig  # noqa: E402
-from bikeped.detection.base import load_detector  # noqa: E402
+from bikeped.detection.detector import load_detector  # noqa: E402
 from bikeped.errors import DataSetError, DetectorError  # noqa: E402
 from bikeped.lab.training.coco import read_coco, read_picture  # noqa: E402
 from bikeped.lab.training.crops import CropSettings  # noqa: E402

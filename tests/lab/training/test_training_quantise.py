@@ -9,7 +9,7 @@ from coco_sets import annotation, write_set
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'bikeped[train]'")
 
 from bikeped.config.schema import DetectionConfig  # noqa: E402
-from bikeped.detection.base import load_detector  # noqa: E402
+from bikeped.detection.detector import load_detector  # noqa: E402
 from bikeped.errors import DetectorError  # noqa: E402
 from bikeped.lab.training.coco import read_coco  # noqa: E402
 from bikeped.lab.training.export import calibration_images, export_network, quantise  # noqa: E402

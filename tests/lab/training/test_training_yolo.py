@@ -18,7 +18,7 @@ import yaml
 from coco_sets import annotation, write_set
 
 from bikeped.config.schema import DetectionConfig
-from bikeped.detection.base import load_detector
+from bikeped.detection.detector import load_detector
 from bikeped.errors import DataSetError, DetectorError
 from bikeped.lab.training.coco import read_coco
 
