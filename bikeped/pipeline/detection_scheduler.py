@@ -164,7 +164,7 @@ class DetectionScheduler:
     """Takes frames from `feed`, decodes and detects them in threads, awaits `on_answer` for each.
 
     One thread decodes, `max_inflight` threads detect. On a live feed a frame that fails, or does
-    not fit the camera of `ground_mapper`, costs itself, is counted and reported to `monitor`; in a
+    not fit the camera of `ground_mapper`, has the answer None and is reported to `monitor`; in a
     recording the error ends `detect_frames`, after the frames before it were passed on.
     """
 
@@ -175,19 +175,15 @@ class DetectionScheduler:
         monitor: FaultMonitor,
         counts: FrameCounts,
         ground_mapper: GroundMapper,
-        on_size_error: Callable[[], None],
-        on_answer: Callable[[DecodedFrame, DetectionResult], Awaitable[None]],
-        *,
-        max_inflight: int,
+        on_answer: Callable[[DecodedFrame, DetectionResult | None], Awaitable[None]],
         clock: Callable[[], float],
     ) -> None:
         self._feed, self._detection = feed, detection
         self._monitor, self._counts = monitor, counts
-        self._ground_mapper, self._on_size_error = ground_mapper, on_size_error
-        self._on_answer, self._clock = on_answer, clock
+        self._ground_mapper, self._on_answer, self._clock = ground_mapper, on_answer, clock
         self._slot = LatestFrameSlot()
         self._decoder = WorkerThread("decode", clock)
-        self._idle = [WorkerThread("detect", clock) for _ in range(max_inflight)]
+        self._idle = [WorkerThread("detect", clock) for _ in range(detection.max_inflight)]
         self.workers = (self._decoder, *self._idle)
         self._inflight = deque[_InFlight]()
         self._usual_detect_s = self._usual_decode_s = 0.0
@@ -217,9 +213,10 @@ class DetectionScheduler:
             except CaptureError as error:
                 self._counts.undecodable += 1
                 self._limited_log.warn("decode", f"frame {frame.number} is skipped: {error}")
-                self._monitor.not_decoded(error, self._clock())
+                detail = f"frames do not decode ({error})"
+                self._monitor.record("camera.undecodable", "camera", detail, self._clock())
                 continue
-            self._monitor.decoded()
+            self._monitor.record("camera.undecodable", "camera", None, self._clock())
             self._usual_decode_s += _NEWEST_WEIGHT * (
                 decoded.decode_ms / 1e3 - self._usual_decode_s
             )
@@ -260,8 +257,7 @@ class DetectionScheduler:
                 answer = self._result(oldest)
                 # The next frame is detected while this one is processed: detection takes longest.
                 self._dispatch()
-                if answer is not None:
-                    await self._on_answer(oldest.decoded, answer)
+                await self._on_answer(oldest.decoded, answer)
         finally:
             for frame in inflight:
                 if not frame.answer.cancel() and not frame.answer.cancelled():
@@ -270,41 +266,32 @@ class DetectionScheduler:
     def _dispatch(self) -> None:
         """Hands the waiting frame to an idle detector thread."""
         while self._idle and (decoded := self._slot.get_nowait()) is not None:
-            error = None
-            try:
-                self._ground_mapper.framing_for(decoded.frame.width, decoded.frame.height)
-            except GeometryError as misfit:
-                error = misfit
-            if self._feed.live:
-                self._monitor.sized(error)
-                if error is not None:
-                    self._on_size_error()
-                    continue
             worker, began_s = self._idle.pop(), time.perf_counter()
-            if error is None:
-                answer = worker.submit(self._detection.detect, decoded)
-            else:
-                # Ends the replay after the frames before it.
-                answer = asyncio.get_running_loop().create_future()
-                answer.set_exception(error)
+            answer = worker.submit(self._detect, decoded)
             self._inflight.append(_InFlight(decoded, worker, began_s, answer))
 
+    def _detect(self, decoded: DecodedFrame) -> DetectionResult:
+        self._ground_mapper.framing_for(decoded.frame.width, decoded.frame.height)  # may raise
+        return self._detection.detect(decoded)
+
     def _result(self, done: _InFlight) -> DetectionResult | None:
-        """The detector's answer; None when it failed on a live frame."""
-        took_s = time.perf_counter() - done.began_s
+        """The detector's answer; None when it failed on a live frame, or the frame did not fit."""
+        took_s, now_s = time.perf_counter() - done.began_s, self._clock()
         self._usual_detect_s += _NEWEST_WEIGHT * (took_s - self._usual_detect_s)
-        try:
-            answer = done.answer.result()
-        except Exception as error:
-            if not self._feed.live:
-                raise
-            self._counts.failed += 1
-            if isinstance(error, BikepedError):
-                number = done.decoded.frame.number
-                self._limited_log.warn("detector", f"frame {number} is skipped: {error}")
-            else:
-                self._limited_log.failure("detector", error)
-            self._monitor.not_answered(error, self._clock())
+        error, number = done.answer.exception(), done.decoded.frame.number
+        if error is not None and not self._feed.live:
+            raise error
+        misfit = str(error) if isinstance(error, GeometryError) else None
+        self._monitor.record("camera.frame_size", "geometry", misfit, now_s)
+        if misfit is not None:
             return None
-        self._monitor.answered()
-        return answer
+        failure = None if error is None else str(error)
+        self._monitor.record("detector.error", "detector", failure, now_s)
+        if error is None:
+            return done.answer.result()
+        self._counts.failed += 1
+        if isinstance(error, BikepedError):
+            self._limited_log.warn("detector", f"frame {number} is skipped: {error}")
+        else:
+            self._limited_log.failure("detector", error)
+        return None

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from bikeped.errors import GeometryError
 from bikeped.faults import Effect, Fault
 from bikeped.pipeline.feed import Feed
 from bikeped.pipeline.runtime import WorkerThread
@@ -40,12 +39,9 @@ class Limits:
 
 DEFAULT_LIMITS = Limits()
 
-#: Code of the fault of an age -> its source, and what is missing.
-_AGED = {"camera.no_frame": ("camera", "frame"), "detector.no_answer": ("detector", "answer")}
-
 
 @dataclass(frozen=True)
-class _Since:
+class _Failure:
     """The first fault of an unbroken run of failures, so that one run is one fault."""
 
     fault: Fault
@@ -64,31 +60,15 @@ class FaultMonitor:
     ) -> None:
         self._feed, self._limits = feed, limits
         self._sources = tuple(sources)
-        self._frame_size: Fault | None = None
-        self._undecodable: _Since | None = None
-        self._failing: _Since | None = None
+        self._failures: dict[str, _Failure] = {}  # by code
         self._answered_s: float | None = None
 
-    def decoded(self) -> None:
-        self._undecodable = None
-
-    def not_decoded(self, error: Exception, now_s: float) -> None:
-        if self._undecodable is None:
-            detail = f"frames do not decode ({error})"
-            self._undecodable = _Since(Fault("camera", "camera.undecodable", detail), now_s)
-
-    def sized(self, error: GeometryError | None) -> None:
-        """A frame has the configured proportions (None), or `error` says why not."""
-        self._frame_size = (
-            None if error is None else Fault("geometry", "camera.frame_size", str(error))
-        )
-
-    def answered(self) -> None:
-        self._failing = None
-
-    def not_answered(self, error: Exception, now_s: float) -> None:
-        if self._failing is None:
-            self._failing = _Since(Fault("detector", "detector.error", str(error)), now_s)
+    def record(self, code: str, source: str, detail: str | None, now_s: float) -> None:
+        """What a stage did with a frame: it failed as `detail` says, or did well (None)."""
+        if detail is None:
+            self._failures.pop(code, None)
+        elif code not in self._failures:
+            self._failures[code] = _Failure(Fault(source, code, detail), now_s)
 
     def processed(self, captured_s: float) -> None:
         """The frame captured at `captured_s` led to a decision."""
@@ -100,19 +80,22 @@ class FaultMonitor:
             return ()
         error, limits = self._feed.error(), self._limits
         faults: list[Fault | None] = [
-            _age_fault("camera.no_frame", now_s, self._feed.newest_s(now_s), limits.stale_after_s),
-            _age_fault("detector.no_answer", now_s, self._answered_s, limits.silent_after_s),
-            self._frame_size,
+            _age_fault("camera", "frame", now_s, self._feed.newest_s(now_s), limits.stale_after_s),
+            _age_fault("detector", "answer", now_s, self._answered_s, limits.silent_after_s),
+            *self._failed("camera.frame_size"),
             None if error is None else Fault("camera", "camera.error", error),
             *self._from_sources(Effect.FAULT),
         ]
         if any(faults):  # the cause, where a stage fails; one bad frame among good ones is no fault
-            faults += [run.fault for run in (self._undecodable, self._failing) if run is not None]
+            faults += self._failed("camera.undecodable", "detector.error")
         return tuple(fault for fault in faults if fault is not None)
 
     def notices(self) -> tuple[Fault, ...]:
         """The faults of other parts that leave the light as decided."""
         return tuple(self._from_sources(Effect.NOTICE))
+
+    def _failed(self, *codes: str) -> list[Fault]:
+        return [self._failures[code].fault for code in codes if code in self._failures]
 
     def _from_sources(self, effect: Effect) -> Iterable[Fault]:
         faults = (source() for source in self._sources)
@@ -123,31 +106,34 @@ class FaultMonitor:
 
         `workers` run the decoder and the detector.
         """
-        limit_s = self._limits.hang_after_s
-        if self._feed.hung_s(now_s) > limit_s:
-            detail = f"a read has not returned for {limit_s:g} s"
-            raise StageHangError(Fault("camera", "camera.hang", detail))
-        if max(worker.busy_s(now_s) for worker in workers) > limit_s:
-            detail = f"has not returned for {limit_s:g} s"
-            raise StageHangError(Fault("detector", "detector.hang", detail))
-        # A GPU that has failed once may fail until the process ends.
-        if self._failing is not None and now_s - self._failing.began_s > limit_s:
-            detail = f"{self._failing.fault.detail} (for {limit_s:g} s)"
-            raise StageHangError(Fault("detector", "detector.failing", detail))
-        run = self._undecodable
-        if run is not None and now_s - run.began_s > RESTART_AFTER_S:
-            self._undecodable = _Since(run.fault, now_s)
+        limit_s, busy_s = self._limits.hang_after_s, max(w.busy_s(now_s) for w in workers)
+        hung = [
+            ("camera", "camera.hang", self._feed.hung_s(now_s), "a read has not returned"),
+            ("detector", "detector.hang", busy_s, "has not returned"),
+        ]
+        if (failing := self._failures.get("detector.error")) is not None:
+            # A GPU that has failed once may fail until the process ends.
+            lasted_s = now_s - failing.began_s
+            hung.append(("detector", "detector.failing", lasted_s, failing.fault.detail))
+        for source, code, lasted_s, text in hung:
+            if lasted_s > limit_s:
+                raise StageHangError(Fault(source, code, f"{text} for {limit_s:g} s"))
+        undecodable = self._failures.get("camera.undecodable")
+        if undecodable is not None and now_s - undecodable.began_s > RESTART_AFTER_S:
+            self._failures["camera.undecodable"] = _Failure(undecodable.fault, now_s)
             self._feed.restart()
 
 
-def _age_fault(code: str, now_s: float, newest_s: float | None, limit_s: float) -> Fault | None:
-    """The fault of a newest frame or answer: `code` if missing or too old, or a future time."""
-    component, what = _AGED[code]
+def _age_fault(
+    source: str, what: str, now_s: float, newest_s: float | None, limit_s: float
+) -> Fault | None:
+    """`camera.no_frame` or `detector.no_answer` if the newest is missing or too old, or
+    `future_time`."""
     age_s = math.nan if newest_s is None else now_s - newest_s
     if age_s < -limit_s:
         problem = f"no {what} with a usable time: the newest lies in the future"
-        return Fault(component, f"{component}.future_time", problem)
+        return Fault(source, f"{source}.future_time", problem)
     if age_s <= limit_s:  # false for a NaN age, so that it is a fault, too
         return None
     problem = f"no {what} yet" if newest_s is None else f"no {what} for more than {limit_s:g} s"
-    return Fault(component, code, problem)
+    return Fault(source, f"{source}.no_{what}", problem)

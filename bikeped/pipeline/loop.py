@@ -164,10 +164,8 @@ class Loop:
             self.monitor,
             self.counts,
             self._track_and_decide.ground_mapper,
-            self._show_without_frame,
             self._process,
-            max_inflight=self._detection.max_inflight,
-            clock=self._clock,
+            self._clock,
         )
         detecting = asyncio.create_task(scheduler.detect_frames(), name="detect")
         stopping = asyncio.create_task(self.stopping.wait(), name="stop")
@@ -198,8 +196,11 @@ class Loop:
             await asyncio.gather(*tasks, return_exceptions=True)
             await asyncio.gather(scheduler.close(self._limits.close_s), self.feed.close())
 
-    async def _process(self, decoded: DecodedFrame, answer: DetectionResult) -> None:
+    async def _process(self, decoded: DecodedFrame, answer: DetectionResult | None) -> None:
         """Tracks and decides one answered frame, sets the light, and passes the result on."""
+        if answer is None:
+            self._show_without_frame()
+            return
         frame = decoded.frame
         if self._newest_s is not None and not frame.captured_s > self._newest_s:
             # A camera that was opened anew, on another clock. Its frames count again as soon as

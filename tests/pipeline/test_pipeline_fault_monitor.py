@@ -7,7 +7,6 @@ import math
 import pytest
 from pipeline_fakes import FakeFeed
 
-from bikeped.errors import CaptureError, DetectorError
 from bikeped.faults import Fault, fault_texts
 from bikeped.pipeline.fault_monitor import FaultMonitor, Limits
 
@@ -73,8 +72,8 @@ def test_a_recording_has_no_faults():
 
 def test_a_failing_stage_explains_a_silence_and_is_none_by_itself():
     watch = monitor(10.0, 10.0)
-    watch.not_decoded(CaptureError("broken"), 10.0)
-    watch.not_answered(DetectorError("device lost"), 10.0)
+    watch.record("camera.undecodable", "camera", "broken", 10.0)
+    watch.record("detector.error", "detector", "device lost", 10.0)
     assert watch.faults(10.1) == ()
     assert [fault.code for fault in watch.faults(11.0)] == [
         "camera.no_frame",
@@ -82,8 +81,8 @@ def test_a_failing_stage_explains_a_silence_and_is_none_by_itself():
         "camera.undecodable",
         "detector.error",
     ]
-    watch.decoded()
-    watch.answered()
+    watch.record("camera.undecodable", "camera", None, 11.0)
+    watch.record("detector.error", "detector", None, 11.0)
     assert len(watch.faults(11.0)) == 2
 
 
