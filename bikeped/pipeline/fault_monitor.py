@@ -61,7 +61,7 @@ class FaultMonitor:
         self._feed, self._limits = feed, limits
         self._sources = tuple(sources)
         self._failures: dict[str, _Failure] = {}  # by code
-        self._answered_s: float | None = None
+        self._answered_s = -math.inf  # capture time of the newest processed frame
 
     def record(self, code: str, source: str, detail: str | None, now_s: float) -> None:
         """What a stage did with a frame: it failed as `detail` says, or did well (None)."""
@@ -78,12 +78,12 @@ class FaultMonitor:
         """The faults with which the light must show FAULT; empty when the decision holds."""
         if not self._feed.live:
             return ()
-        error, limits = self._feed.error(), self._limits
+        error, limits = self._feed.error, self._limits
         faults: list[Fault | None] = [
-            _age_fault("camera", "frame", now_s, self._feed.newest_s(now_s), limits.stale_after_s),
-            _age_fault("detector", "answer", now_s, self._answered_s, limits.silent_after_s),
+            _age_fault("camera", "frame", self._feed.age_s(now_s), limits.stale_after_s),
+            _age_fault("detector", "answer", now_s - self._answered_s, limits.silent_after_s),
             *self._failed("camera.frame_size"),
-            None if error is None else Fault("camera", "camera.error", error),
+            None if error is None else Fault("camera", "camera.error", str(error)),
             *self._from_sources(Effect.FAULT),
         ]
         if any(faults):  # the cause, where a stage fails; one bad frame among good ones is no fault
@@ -124,16 +124,12 @@ class FaultMonitor:
             self._feed.restart()
 
 
-def _age_fault(
-    source: str, what: str, now_s: float, newest_s: float | None, limit_s: float
-) -> Fault | None:
-    """`camera.no_frame` or `detector.no_answer` if the newest is missing or too old, or
-    `future_time`."""
-    age_s = math.nan if newest_s is None else now_s - newest_s
+def _age_fault(source: str, what: str, age_s: float, limit_s: float) -> Fault | None:
+    """`camera.no_frame` or `detector.no_answer` for none yet or an old one, or `future_time`."""
     if age_s < -limit_s:
         problem = f"no {what} with a usable time: the newest lies in the future"
         return Fault(source, f"{source}.future_time", problem)
     if age_s <= limit_s:  # false for a NaN age, so that it is a fault, too
         return None
-    problem = f"no {what} yet" if newest_s is None else f"no {what} for more than {limit_s:g} s"
+    problem = f"no {what} yet" if age_s == math.inf else f"no {what} for more than {limit_s:g} s"
     return Fault(source, f"{source}.no_{what}", problem)

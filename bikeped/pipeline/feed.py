@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from bikeped.capture.base import FrameSource
 from bikeped.capture.frame_grabber import FrameGrabber
+from bikeped.errors import CaptureError
 from bikeped.pipeline.runtime import WorkerThread
 from bikeped.types import Frame
 
@@ -17,26 +18,20 @@ class Feed:
     """A source of frames for the loop. As it stands here, a recording: never late, never hung."""
 
     live = False
+    dropped = 0  #: frames that were replaced by a newer one before they were taken
+    error: CaptureError | None = None  #: what is wrong with the source now
 
     async def next_frame(self) -> tuple[Frame, float] | None:
         """The next frame and how long getting it took in ms; None at the end of a recording."""
         raise NotImplementedError
 
-    def newest_s(self, now_s: float) -> float | None:
-        """When the newest frame arrived, on the loop's clock; None before the first."""
-        return None
-
-    def dropped(self) -> int:
-        """Frames that were replaced by a newer one before they were taken."""
-        return 0
+    def age_s(self, now_s: float) -> float:
+        """Time since the newest frame arrived, on the loop's clock; infinite before the first."""
+        return math.inf
 
     def hung_s(self, now_s: float) -> float:
         """How long the read in progress has not returned, in seconds."""
         return 0.0
-
-    def error(self) -> str | None:
-        """What is wrong with the source now, in one line."""
-        return None
 
     def restart(self) -> None:
         """Asks for the source to be opened anew: its frames cannot be used."""
@@ -45,41 +40,19 @@ class Feed:
         """Closes the source; takes a bounded time, whatever the source does."""
 
 
-class LiveFeed(Feed):
-    """The newest frame of a camera; old ones are dropped and counted."""
+class LiveFeed(FrameGrabber, Feed):
+    """The newest frame of a camera, from `start` on; old ones are dropped and counted."""
 
     live = True
 
-    def __init__(self, grabber: FrameGrabber) -> None:
-        self._grabber = grabber
-
     async def next_frame(self) -> tuple[Frame, float] | None:
-        while True:
-            frame = await self._grabber.next(1.0)
-            if frame is not None:
-                return frame, max(0.0, (time.monotonic() - frame.captured_s) * 1e3)
-            if self._grabber.ended:
+        while (frame := await self.next(1.0)) is None:
+            if self.ended:
                 return None
-
-    def newest_s(self, now_s: float) -> float | None:
-        age_s = self._grabber.age_s(now_s)
-        return now_s - age_s if math.isfinite(age_s) else None
-
-    def dropped(self) -> int:
-        return self._grabber.dropped
-
-    def hung_s(self, now_s: float) -> float:
-        return self._grabber.hung_s(now_s)
-
-    def error(self) -> str | None:
-        error = self._grabber.error
-        return None if error is None else str(error)
-
-    def restart(self) -> None:
-        self._grabber.restart()
+        return frame, max(0.0, (time.monotonic() - frame.captured_s) * 1e3)
 
     async def close(self) -> None:
-        await asyncio.to_thread(self._grabber.stop)
+        await asyncio.to_thread(self.stop)
 
 
 class RecordedFeed(Feed):

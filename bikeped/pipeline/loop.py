@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -138,7 +139,7 @@ class Loop:
         self._limited_log = RateLimitedLogger(log)
         self.stopping = asyncio.Event()  #: ends `run`
         self._first_s: float | None = None  # capture time of the first result
-        self._newest_s: float | None = None  # capture time of the newest result
+        self._newest_s = -math.inf  # capture time of the newest result
 
     def stop(self) -> None:
         """Ends `run`; callable from a signal handler."""
@@ -146,9 +147,8 @@ class Loop:
 
     def frame_age_s(self) -> float | None:
         """Age of the newest frame of a live feed; None before the first."""
-        now_s = self._clock()
-        newest_s = self.feed.newest_s(now_s)
-        return None if newest_s is None else max(0.0, now_s - newest_s)
+        age_s = self.feed.age_s(self._clock())
+        return max(0.0, age_s) if math.isfinite(age_s) else None
 
     async def run(self) -> None:
         """Runs until the recording ends or `stop` is called; the light is then dark.
@@ -202,7 +202,7 @@ class Loop:
             self._show_without_frame()
             return
         frame = decoded.frame
-        if self._newest_s is not None and not frame.captured_s > self._newest_s:
+        if not frame.captured_s > self._newest_s:
             # A camera that was opened anew, on another clock. Its frames count again as soon as
             # they are newer; until then the missing answers become a FAULT.
             self.counts.out_of_order += 1

@@ -14,7 +14,6 @@ from typing import Any
 from bikeped import __version__
 from bikeped.capture import open_source
 from bikeped.capture.base import FrameSource
-from bikeped.capture.frame_grabber import FrameGrabber
 from bikeped.capture.recordings import PacedSource
 from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import check_provenance
@@ -28,7 +27,7 @@ from bikeped.pipeline.application import Application, Pages, load_detector_pool,
 from bikeped.pipeline.detection_scheduler import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed
-from bikeped.pipeline.runtime import Notifier, WorkerThread
+from bikeped.pipeline.runtime import WorkerThread, notify
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
 from bikeped.telemetry.event_files import AuditLog
@@ -70,13 +69,11 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
     log.log(logging.INFO if provenance.holds else logging.WARNING, "%s", provenance.text)
     config, ground_mapper = loaded.config, GroundMapper(loaded)
     light = light_driver(config.feedback)
-    notifier = Notifier()
     async with contextlib.AsyncExitStack() as last, contextlib.AsyncExitStack() as stack:
-        last.callback(notifier.close)
         light.start()  # shows FAULT until the first signal
         last.push_async_callback(_darken, light)  # done last, whatever ends the service
         if detector is None:
-            detector = await _load_while_alive(loaded, light, notifier, stop)
+            detector = await _load_while_alive(loaded, light, stop)
         if detector is None:
             return 0
         log.info("detector: %s, sha256 %s", detector.name, detector.model_hash or "none")
@@ -91,13 +88,13 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
             audit.start()
             stack.push_async_callback(asyncio.to_thread, audit.close)
         stale_after_s = config.camera.stale_after_s
-        grabber = FrameGrabber(partial(_open_camera, loaded), stale_after_s=stale_after_s)
+        camera = LiveFeed(partial(_open_camera, loaded), stale_after_s=stale_after_s)
         application = Application(
             loaded,
             detector,
             TrackAndDecide(loaded, detector.cyclist_box_includes_rider, ground_mapper),
             stack,
-            feed=LiveFeed(grabber),
+            feed=camera,
             source=config.camera.source,
             light=light,
             mqtt=config.mqtt.enabled,
@@ -107,12 +104,12 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
             limits=Limits(
                 stale_after_s, config.detection.silent_after_s, config.camera.hang_after_s
             ),
-            on_tick=notifier.alive,
+            on_tick=partial(notify, "WATCHDOG=1"),
         )
-        grabber.start()
+        camera.start()
         await application.serve_pages()
         application.loop.stopping = stop  # which may be set already
-        notifier.ready(f"watching {config.camera.source}")
+        notify("READY=1", f"STATUS=watching {config.camera.source}")
         try:
             await application.run()
         except StageHangError as hang:
@@ -120,7 +117,7 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
             return hang.fault.kind.exit_status or 0
         finally:
             log.info("stopping")
-            notifier.stopping()
+            notify("STOPPING=1")
             # Stopping the rest may take seconds: keeps the light's watchdog from tripping.
             last.callback(asyncio.create_task(_refresh(application.dispatcher)).cancel)
             log.info("latency\n%s", application.telemetry.times.table())
@@ -134,7 +131,7 @@ def _open_camera(loaded: LoadedConfig) -> FrameSource:
 
 
 async def _load_while_alive(
-    loaded: LoadedConfig, light: LightDriver, notifier: Notifier, stop: asyncio.Event
+    loaded: LoadedConfig, light: LightDriver, stop: asyncio.Event
 ) -> FrameDetector | None:
     """Loads the model in a thread (an engine may take minutes to build), showing FAULT meanwhile.
 
@@ -151,7 +148,7 @@ async def _load_while_alive(
         while not (loading.done() or stopping.done()):
             light.show(starting)
             if time.monotonic() - began_s < LOAD_LIMIT_S:
-                notifier.starting(30.0, "loading the model")
+                notify("EXTEND_TIMEOUT_USEC=30000000", "WATCHDOG=1", "STATUS=loading the model")
             await asyncio.wait(either, timeout=_REFRESH_S, return_when=asyncio.FIRST_COMPLETED)
         return await loading if loading.done() else None
     finally:

@@ -144,7 +144,7 @@ class Telemetry:
         return Counters(
             received=counts.received,
             frames=counts.frames,
-            dropped=loop.feed.dropped(),
+            dropped=loop.feed.dropped,
             undecodable=counts.undecodable,
             failed=counts.failed,
             out_of_order=counts.out_of_order,

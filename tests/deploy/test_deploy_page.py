@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -58,10 +59,10 @@ def test_only_commands_of_the_interface_are_used() -> None:
 def test_the_fault_table_has_the_texts_that_the_code_writes() -> None:
     with pytest.raises(GeometryError) as error:
         framing(load_config(None)).for_frame(64, 64)
-    feed = SimpleNamespace(live=True, error=lambda: None, newest_s=lambda _: None)
+    feed = SimpleNamespace(live=True, error=None, age_s=lambda _: math.inf)
     monitor = FaultMonitor(feed, Limits())  # type: ignore[arg-type]
     begin = monitor.faults(0.0)
-    feed.newest_s = lambda _: 0.0
+    feed.age_s = lambda now_s: now_s
     monitor.processed(0.0)
     misfit = Fault("geometry", "camera.frame_size", str(error.value))
     faults = [*begin, *monitor.faults(9.0), misfit, NOT_REFRESHED]

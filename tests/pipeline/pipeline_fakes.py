@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 from collections.abc import Callable
 
@@ -57,7 +58,8 @@ class FakeFeed:
         self.live = live
         self.queue: asyncio.Queue[Frame | Exception | None] = asyncio.Queue()
         self.last_s: float | None = None
-        self.trouble: str | None = None
+        self.error: Exception | None = None
+        self.dropped = 0
         self.hang_s = 0.0
         self.restarts = 0
         self.closed = False
@@ -77,17 +79,11 @@ class FakeFeed:
             raise item
         return None if item is None else (item, 1.0)
 
-    def newest_s(self, now_s: float) -> float | None:
-        return self.last_s
-
-    def dropped(self) -> int:
-        return 0
+    def age_s(self, now_s: float) -> float:
+        return math.inf if self.last_s is None else now_s - self.last_s
 
     def hung_s(self, now_s: float) -> float:
         return self.hang_s
-
-    def error(self) -> str | None:
-        return self.trouble
 
     def restart(self) -> None:
         self.restarts += 1

@@ -192,7 +192,7 @@ async def test_a_time_that_goes_back_is_counted_and_becomes_a_fault():
 async def test_a_camera_error_is_told_and_is_a_fault_at_once():
     async with Rig() as rig:
         await rig.well()
-        rig.feed.trouble = "/dev/video0: no such camera"
+        rig.feed.error = CaptureError("/dev/video0: no such camera")
         await rig.recorder.some_ticks()
         assert rig.recorder.faults == ("camera: /dev/video0: no such camera",)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import threading
 
 import numpy as np
@@ -13,12 +14,11 @@ from hypothesis import strategies as st
 from pipeline_fakes import PATIENCE_S, Clock, FakeDetector
 
 from bikeped.capture import open_source
-from bikeped.capture.frame_grabber import FrameGrabber
 from bikeped.config.schema import CameraConfig
 from bikeped.errors import CaptureError
 from bikeped.pipeline.detection_scheduler import DetectionStage
 from bikeped.pipeline.feed import LiveFeed, RecordedFeed
-from bikeped.pipeline.runtime import Notifier, RateLimitedLogger, WorkerThread
+from bikeped.pipeline.runtime import RateLimitedLogger, WorkerThread, notify
 from bikeped.types import Frame
 
 
@@ -127,12 +127,11 @@ async def test_a_live_feed_that_ended_says_so_and_one_that_broke_says_why(make_c
         def read(self) -> Frame | None:
             return None
 
-    grabber = FrameGrabber(Ends)  # type: ignore[arg-type]
-    grabber.start()
-    feed = LiveFeed(grabber)
+    feed = LiveFeed(Ends)  # type: ignore[arg-type]
+    feed.start()
     assert await asyncio.wait_for(feed.next_frame(), PATIENCE_S) is None
-    assert feed.newest_s(1.0) is None
-    assert feed.error() is None
+    assert feed.age_s(1.0) == math.inf
+    assert feed.error is None
     await feed.close()
 
     failed = asyncio.Event()
@@ -142,12 +141,11 @@ async def test_a_live_feed_that_ended_says_so_and_one_that_broke_says_why(make_c
         loop.call_soon_threadsafe(failed.set)
         raise CaptureError("/dev/video7: no such camera")
 
-    grabber = FrameGrabber(breaks)  # type: ignore[arg-type,return-value]
-    grabber.start()
-    feed = LiveFeed(grabber)
+    feed = LiveFeed(breaks)  # type: ignore[arg-type,return-value]
+    feed.start()
     await asyncio.wait_for(failed.wait(), PATIENCE_S)
     await feed.close()  # waits for the thread, which sets the error right after the call above
-    assert feed.error() == "/dev/video7: no such camera"
+    assert str(feed.error) == "/dev/video7: no such camera"
 
 
 STAGE = DetectionStage(FakeDetector())
@@ -176,11 +174,6 @@ def test_a_damaged_jpeg_is_a_picture_or_refused(small_jpegs, data):
 
 def test_without_a_service_manager_nothing_is_sent_and_nothing_fails(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    notifier = Notifier()
-    notifier.ready("up")
-    notifier.alive()
-    notifier.close()
+    notify("READY=1", "STATUS=up")
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere/notify")
-    gone = Notifier()
-    gone.alive()
-    gone.close()
+    notify("WATCHDOG=1")
