@@ -189,6 +189,10 @@ def decode(
             f"{source}: output has shape {list(shape)}, which is not {layout} with "
             f"{classes} classes"
         )
+    if not wanted.any():
+        return Candidates(
+            np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64)
+        )
     least = np.broadcast_to(np.asarray(confidence, np.float32), wanted.shape)
     with np.errstate(all="ignore"):
         if layout == "end2end":
@@ -216,8 +220,6 @@ def _end2end(
     class_number = rows[:, 5]
     known = (class_number > -0.5) & (class_number < len(wanted) - 0.5)
     class_id = np.rint(np.where(known, class_number, 0)).astype(np.int64)
-    if len(wanted) == 0:
-        return _none()
     keep = known & (rows[:, 4] >= least[class_id]) & wanted[class_id]
     return Candidates(rows[keep, :4], rows[keep, 4], class_id[keep])
 
@@ -226,8 +228,6 @@ def _yolov8(
     table: npt.NDArray[Any], least: Float32Array, wanted: BoolArray, source: str
 ) -> Candidates:
     index = np.nonzero(wanted)[0]
-    if len(index) == 0 or table.shape[1] == 0:
-        return _none()
     # Cheap first: the best of the few wanted classes, over all anchors. An anchor whose best class
     # is wanted passes this, so nothing is lost; the full comparison is for the few left.
     best = table[4 + index].max(axis=0)
@@ -250,8 +250,6 @@ def _with_objectness(
         raise DetectorError(
             f"{source}: {len(rows)} rows are not YOLOX's for an input of {size[0]} x {size[1]}"
         )
-    if not wanted.any() or len(rows) == 0:
-        return _none()
     objectness = rows[:, 4]
     _check_probabilities(objectness, source)
     # The score is objectness times a probability: it cannot exceed the objectness.
@@ -270,8 +268,6 @@ def _best_class(
     box: Float32Array, scores: Float32Array, least: Float32Array, wanted: BoolArray
 ) -> Candidates:
     """One class a box, its best; kept where that is wanted and strong enough."""
-    if len(scores) == 0:
-        return _none()
     class_id = scores.argmax(axis=1)
     score = np.take_along_axis(scores, class_id[:, None], axis=1)[:, 0]
     keep = wanted[class_id] & (score >= least[class_id])
@@ -335,7 +331,3 @@ def _fitting(
 
 def _fits_text(fits: dict[Layout, int | None]) -> str:
     return "it could be " + " or ".join(fits) if fits else "it fits none"
-
-
-def _none() -> Candidates:
-    return Candidates(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64))
