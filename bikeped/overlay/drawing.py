@@ -12,6 +12,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import simplejpeg
 
 from bikeped.geometry.boxes import intersection_area
 from bikeped.types import FloatArray, ImageArray, Kind
@@ -233,6 +234,14 @@ def draw_tag(
     ink = readable_on(colour)
     draw_text(image, text, (u, v - height / 2), height, ink, bold=True, anchor="centre")
     return rect
+
+
+def encode_jpeg(rgb: ImageArray, quality: int = 85) -> bytes:
+    """`rgb` [h, w, 3] as a JPEG file."""
+    jpeg: bytes = simplejpeg.encode_jpeg(
+        np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420"
+    )
+    return jpeg
 
 
 def _clipped(image: ImageArray, rect: Rect) -> tuple[slice, slice]:

@@ -20,8 +20,7 @@ from bikeped.config.load import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.errors import BikepedError, GeometryError
 from bikeped.feedback.light import LightDriver, SimulatedLight
-from bikeped.overlay.compose import compose
-from bikeped.overlay.video_writer import VideoWriter
+from bikeped.overlay.video import VideoWriter, compose
 from bikeped.pipeline.application import Application, Pages, load_detector_pool, new_event_header
 from bikeped.pipeline.detection_scheduler import FrameDetector
 from bikeped.pipeline.feed import RecordedFeed

@@ -19,7 +19,7 @@ import numpy as np
 from bikeped.capture.jpeg import JpegDecoder
 from bikeped.errors import CaptureError
 from bikeped.overlay.camera_view import draw_overlay
-from bikeped.overlay.compose import encode_jpeg
+from bikeped.overlay.drawing import encode_jpeg
 from bikeped.overlay.overlay_data import GroundToFrame, OverlayData
 from bikeped.pipeline.loop import FrameResult, frame_overlay
 from bikeped.pipeline.runtime import RateLimitedLogger, WorkerThread

@@ -10,11 +10,10 @@ from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import Lens
 from bikeped.overlay.camera_view import draw_overlay
-from bikeped.overlay.compose import compose, encode_jpeg
-from bikeped.overlay.drawing import INK, KIND_COLOUR, SIGNAL_COLOUR
+from bikeped.overlay.drawing import INK, KIND_COLOUR, SIGNAL_COLOUR, encode_jpeg
 from bikeped.overlay.overlay_data import OverlayData, ground_projector
 from bikeped.overlay.radar import RadarProjection, draw_radar
-from bikeped.overlay.video_writer import VideoWriter
+from bikeped.overlay.video import VideoWriter, compose
 from bikeped.types import Colour, Decision, Detections, Kind, PairMetrics, Signal, State, Tracks
 
 GREY = np.full((432, 768, 3), 120, np.uint8)
