@@ -314,10 +314,10 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
 
 
 def test_udev_rules_match_what_the_code_drives() -> None:
-    from bikeped.feedback.usb import _IDS
+    from bikeped.feedback.usb import _DEVICES
 
     text = RULES.read_text()
-    for vendor, product in _IDS.values():
+    for _, vendor, product in _DEVICES.values():
         assert f'ATTR{{idVendor}}=="{vendor:04x}", ATTR{{idProduct}}=="{product:04x}"' in text
     for line in text.splitlines():
         if line and not line.startswith("#"):
