@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
+import cv2
 import msgspec
+from rich.markup import escape
 
+from bikeped.capture import open_source
+from bikeped.capture.jpeg import JpegDecoder
 from bikeped.cli.common import (
     PATH,
     FiniteRange,
@@ -23,12 +26,15 @@ from bikeped.config.build import framing, ground_camera
 from bikeped.config.load import LoadedConfig, load_config
 from bikeped.errors import BikepedError, CaptureError
 from bikeped.files import write_whole
+from bikeped.geometry.alignment import PARAMETER_NAMES, AlignmentFit
+from bikeped.geometry.camera import GroundCamera
+from bikeped.geometry.framing import Framing
 from bikeped.types import Frame
-
-if TYPE_CHECKING:
-    from bikeped.geometry.alignment import Alignment, AlignmentFit
-    from bikeped.web.align_points import Points
-    from bikeped.web.align_save import Saved
+from bikeped.web.align import add_align
+from bikeped.web.align_grid import draw_grid, ground_grid
+from bikeped.web.align_points import Points, fit_json, fit_points, load_points
+from bikeped.web.align_save import Saved, file_hash, save
+from bikeped.web.server import serve_pages
 
 
 @click.command("align")
@@ -76,16 +82,13 @@ def command(
     Serves the align page, with the ground grid over FRAME, until Ctrl-C. With --points or --grid it
     needs no browser, and ends with 1 when the marks do not agree with one another.
     """
-    from bikeped.web.align_points import fit_json, fit_points, load_points
-    from bikeped.web.align_save import file_hash, save
-
     loaded = load_config(config_path, overrides)
     frame = _read_frame(picture, loaded, at_s)
     if points_path is None and (write or json_path is not None):
         raise BikepedError("--points: missing; --save and --json need a fit of marks")
     if grid_path is not None and grid_path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise BikepedError(f"--grid {grid_path}: cannot be drawn; name a .png or .jpg file")
-    framing(loaded).for_frame(frame.width, frame.height)  # raises when it does not fit
+    frame_framing = framing(loaded).for_frame(frame.width, frame.height)
     if points_path is None and grid_path is None:
         _serve(loaded, frame, picture, port, no_browser)
         return 0
@@ -98,7 +101,10 @@ def command(
             values = {key: getattr(found.alignment, key) for key in found.standard_errors}
             saved = save(path, values, file_hash(path))
     if grid_path is not None:
-        _draw(loaded, frame, found.alignment if found else None, points, grid_path)
+        camera = ground_camera(loaded)
+        if found is not None:
+            camera = found.alignment.camera(camera)
+        _draw(camera, frame_framing, frame, points, grid_path)
     if found is not None:
         if json_path is not None:
             written = {} if saved is None else {"saved": saved.keys, "backup": str(saved.backup)}
@@ -112,8 +118,6 @@ def command(
 
 def _read_frame(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
     """One frame of a picture, a folder or a video."""
-    from bikeped.capture import open_source
-
     if not picture.exists():
         raise CaptureError(f"{picture}: no such file; give a picture or a video of the camera")
     with open_source(loaded.config.camera, str(picture.absolute())) as source:
@@ -124,9 +128,6 @@ def _read_frame(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
 
 
 def _serve(loaded: LoadedConfig, frame: Frame, picture: Path, port: int, no_browser: bool) -> None:
-    from bikeped.web.align import add_align
-    from bikeped.web.server import serve_pages
-
     def announce(url: str) -> None:
         click.echo(f"{picture.name}: {url}align  (Ctrl-C ends)")
         if not no_browser:
@@ -142,21 +143,9 @@ def _serve(loaded: LoadedConfig, frame: Frame, picture: Path, port: int, no_brow
 
 
 def _draw(
-    loaded: LoadedConfig,
-    frame: Frame,
-    alignment: Alignment | None,
-    points: Points | None,
-    target: Path,
+    camera: GroundCamera, framing: Framing, frame: Frame, points: Points | None, target: Path
 ) -> None:
-    import cv2
-
-    from bikeped.capture.jpeg import JpegDecoder
-    from bikeped.web.align_grid import draw_grid, ground_grid
-
-    camera = ground_camera(loaded)
-    if alignment is not None:
-        camera = alignment.camera(camera)
-    grid = ground_grid(camera, framing(loaded).for_frame(frame.width, frame.height))
+    grid = ground_grid(camera, framing)
     rgb = frame.rgb if frame.rgb is not None else JpegDecoder().decode(frame.jpeg or b"")
     marks: tuple[tuple[str, float, float], ...] = ()
     if points is not None:
@@ -167,10 +156,6 @@ def _draw(
 
 
 def _print(found: AlignmentFit, saved: Saved | None) -> None:
-    from rich.markup import escape
-
-    from bikeped.geometry.alignment import PARAMETER_NAMES
-
     screen = console()
     fitted = []
     for key, error in found.standard_errors.items():

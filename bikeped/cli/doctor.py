@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
+from rich.text import Text
 
 from bikeped.cli.common import config_options, console, json_option, text_table, write_json
 from bikeped.cli.guard import guarded
 from bikeped.config.load import default_config_path, load_config
 from bikeped.errors import BikepedError
-
-if TYPE_CHECKING:
-    from bikeped.pipeline.doctor import Finding
+from bikeped.pipeline.doctor import Finding, checks, run_checks
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skipped": "dim"}
 
@@ -33,8 +31,6 @@ def command(
     json_path: str | None,
 ) -> int:
     """Check camera, model, light, speaker, broker, clock and disk; 1 when one of them fails."""
-    from bikeped.pipeline.doctor import Finding, checks, run_checks
-
     file = config_path or default_config_path()
     findings: list[Finding] = []
     try:
@@ -64,8 +60,6 @@ def command(
 
 
 def _print(findings: list[Finding]) -> None:
-    from rich.text import Text
-
     rows = []
     for f in findings:
         remedy = f"\n-> {f.remedy}" if f.remedy else ""

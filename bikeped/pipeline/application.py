@@ -75,16 +75,14 @@ def load_detector_pool(loaded: LoadedConfig, *, recorded: bool = False) -> Detec
             f"{loaded.source}: detection.model: no model is configured; name an .onnx or .engine "
             "file there, or with --set detection.model=FILE"
         )
-    road = road_region(loaded)
-    threads = cores() // MAX_INFLIGHT
+    road, copies, threads = road_region(loaded), 1, cores() // MAX_INFLIGHT
     engine = detection.model.lower().endswith(".engine")
     if recorded and threads and detection.threads == 0 and not engine:
         from bikeped.detection.onnx_runtime import runs_on_cpu
 
         if runs_on_cpu(detection.providers):
-            shared = msgspec.structs.replace(detection, threads=threads)
-            return DetectorPool(*(load_detector(shared, base, road) for _ in range(MAX_INFLIGHT)))
-    return DetectorPool(load_detector(detection, base, road))
+            detection, copies = msgspec.structs.replace(detection, threads=threads), MAX_INFLIGHT
+    return DetectorPool(*(load_detector(detection, base, road) for _ in range(copies)))
 
 
 def new_event_header(loaded: LoadedConfig, detector: FrameDetector) -> EventHeader:

@@ -238,19 +238,15 @@ class DetectionScheduler:
         try:
             while not (slot.ended and not inflight):
                 self._dispatch()
-                if not inflight:
-                    await slot.full.wait()
-                    continue
+                full = asyncio.ensure_future(slot.full.wait())
+                news: set[asyncio.Future[Any]] = {inflight[0].answer} if inflight else set()
                 if self._idle and not slot.ended:
-                    full = asyncio.ensure_future(slot.full.wait())
-                    either: set[asyncio.Future[Any]] = {inflight[0].answer, full}
-                    try:
-                        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-                    finally:
-                        full.cancel()
-                else:
-                    await asyncio.wait({inflight[0].answer})
-                if not inflight[0].answer.done():
+                    news.add(full)
+                try:
+                    await asyncio.wait(news, return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    full.cancel()
+                if not (inflight and inflight[0].answer.done()):
                     continue
                 oldest = inflight.popleft()
                 self._idle.append(oldest.worker)

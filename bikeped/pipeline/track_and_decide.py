@@ -6,6 +6,7 @@ to measure the stages. No I/O.
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from dataclasses import dataclass
@@ -28,21 +29,14 @@ class GroundMapper:
     """
 
     def __init__(self, loaded: LoadedConfig) -> None:
-        self._sensor_framing = framing(loaded)
+        sensor_framing = framing(loaded)
         self.camera = ground_camera(loaded)
         self.table = GroundTable(
-            self.camera, *self._sensor_framing.crop_wh, step_px=loaded.config.camera.table_step_px
+            self.camera, *sensor_framing.crop_wh, step_px=loaded.config.camera.table_step_px
         )
         self._max_range_m = loaded.config.tracking.max_range_m
-        self._framings: dict[tuple[int, int], Framing] = {}
-
-    def framing_for(self, width: int, height: int) -> Framing:
-        """The framing of frames of this size; GeometryError when they are another camera's."""
-        known = self._framings.get((width, height))
-        if known is None:
-            known = self._sensor_framing.for_frame(width, height)
-            self._framings = {(width, height): known}
-        return known
+        #: The framing of frames of a width and height; GeometryError if they are another camera's.
+        self.framing_for = functools.lru_cache(maxsize=1)(sensor_framing.for_frame)
 
     def to_ground(self, detections: Detections, frame: Framing) -> tuple[GroundPoints, int]:
         """Ground points within range, and how many detections do not end on the ground."""

@@ -132,7 +132,7 @@ def findings(monkeypatch):
 
     def find(*found: Finding) -> None:
         todo = tuple((f.name, lambda loaded, f=f: f, 20) for f in found)
-        monkeypatch.setattr(checks, "checks", lambda **options: todo)
+        monkeypatch.setattr("bikeped.cli.doctor.checks", lambda **options: todo)
 
     return find
 
