@@ -137,13 +137,9 @@ class Loop:
         self.monitor = FaultMonitor(feed, limits, fault_sources)
         self.counts = FrameCounts()
         self._limited_log = RateLimitedLogger(log)
-        self.stopping = asyncio.Event()  #: ends `run`
+        self.stopping = asyncio.Event()  #: set it to end `run`
         self._first_s: float | None = None  # capture time of the first result
         self._newest_s = -math.inf  # capture time of the newest result
-
-    def stop(self) -> None:
-        """Ends `run`; callable from a signal handler."""
-        self.stopping.set()
 
     def frame_age_s(self) -> float | None:
         """Age of the newest frame of a live feed; None before the first."""
@@ -151,7 +147,7 @@ class Loop:
         return max(0.0, age_s) if math.isfinite(age_s) else None
 
     async def run(self) -> None:
-        """Runs until the recording ends or `stop` is called; the light is then dark.
+        """Runs until the recording ends or `stopping` is set; the light is then dark.
 
         Raises StageHangError when a read or the detector has not returned for `hang_after_s`, and
         leaves the light in FAULT; for a recording also the error of a frame that cannot be

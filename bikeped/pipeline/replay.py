@@ -138,15 +138,9 @@ class OverlayVideo:
 
     async def wait(self) -> None:
         """Waits until the current frame is drawn; raises the error of drawing."""
-        task = self._drawing
-        if task is None:
-            return
-        try:
+        if self._drawing is not None:
             # A cancelled caller leaves the thread drawing: the next caller must wait for it, too.
-            await asyncio.shield(task)
-        finally:
-            if task.done():
-                self._drawing = None
+            await asyncio.shield(self._drawing)
 
 
 def replay(
@@ -265,7 +259,7 @@ async def _run_until_signal(
     for number in (signals.SIGTERM, signals.SIGINT):
         # They end the replay after the current frame, with whole files.
         with contextlib.suppress(RuntimeError, ValueError):  # in another thread: no signals
-            running.add_signal_handler(number, loop.stop)
+            running.add_signal_handler(number, loop.stopping.set)
             stack.callback(running.remove_signal_handler, number)
     result.times, began = application.telemetry.times, time.perf_counter()
     await application.run()

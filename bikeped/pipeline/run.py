@@ -9,7 +9,6 @@ import platform
 import signal as signals
 import time
 from functools import partial
-from typing import Any
 
 from bikeped import __version__
 from bikeped.capture import open_source
@@ -141,18 +140,15 @@ async def _load_while_alive(
     starting = fault_signal((LOADING,), loaded.config.feedback.fault_blink_hz)
     worker = WorkerThread("load")
     loading = worker.submit(load_detector_pool, loaded)
-    stopping = asyncio.create_task(stop.wait())
-    either: set[asyncio.Future[Any]] = {loading, stopping}
     began_s = time.monotonic()
     try:
-        while not (loading.done() or stopping.done()):
+        while not (loading.done() or stop.is_set()):
             light.show(starting)
             if time.monotonic() - began_s < LOAD_LIMIT_S:
                 notify("EXTEND_TIMEOUT_USEC=30000000", "WATCHDOG=1", "STATUS=loading the model")
-            await asyncio.wait(either, timeout=_REFRESH_S, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({loading}, timeout=_REFRESH_S)
         return await loading if loading.done() else None
     finally:
-        stopping.cancel()
         loading.cancel()
         await worker.close(0.0)
 

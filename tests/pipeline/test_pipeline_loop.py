@@ -226,7 +226,7 @@ async def test_an_output_that_fails_ends_a_replay():
 async def test_stopping_during_a_blocked_read_is_prompt_and_dark():
     async with Rig() as rig:
         await rig.well()
-        rig.loop.stop()
+        rig.loop.stopping.set()
         await rig.ended()
         assert rig.feed.closed
         assert rig.light.shown[-1].name == "OFF"
@@ -240,7 +240,7 @@ async def test_stopping_while_the_detector_hangs_leaves_it_behind():
         rig.detector.entered.clear()
         rig.feed.put(rig.clock.now_s + 0.03)
         assert await asyncio.to_thread(rig.detector.entered.wait, PATIENCE_S)
-        rig.loop.stop()
+        rig.loop.stopping.set()
         await rig.ended()
         assert not rig.detector.go.is_set()
         assert rig.light.shown[-1].name == "OFF"

@@ -83,7 +83,7 @@ async def test_state_is_published_at_changes_only_and_is_retained():
     async with TelemetryRig() as rig:
         await rig.well()
         await rig.frames(30)
-        rig.loop.stop()
+        rig.loop.stopping.set()
         await rig.ended()
         states = [m["state"] for m in rig.publisher.of("state")]
         assert states == ["FAULT", "IDLE", "OFF"] or states == ["FAULT", "FAULT", "IDLE", "OFF"]
