@@ -67,13 +67,10 @@ class DetectorPool:
         self.model_hash: str | None = first.model_hash
         self.cyclist_box_includes_rider = first.cyclist_box_includes_rider
         self.max_inflight = len(detectors)
-        self._decode_size = first.decode_size
+        self.decode_size = first.decode_size
         self._free: queue.SimpleQueue[Detector] = queue.SimpleQueue()
         for detector in detectors:
             self._free.put(detector)
-
-    def decode_size(self, width: int, height: int) -> tuple[int, int]:
-        return self._decode_size(width, height)
 
     def detect(self, decoded: DecodedFrame) -> DetectionResult:
         detector = self._free.get()
@@ -100,9 +97,8 @@ class DetectionStage:
     def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> DecodedFrame:
         """The decoded frame; raises CaptureError when it does not decode."""
         began = time.perf_counter()
-        if frame.rgb is not None:
-            rgb = frame.rgb
-        else:
+        rgb = frame.rgb
+        if rgb is None:
             assert frame.jpeg is not None  # noqa: S101  Frame holds one of the two
             width, height = self._decode_size(frame.width, frame.height)
             view = min(self._view_width, frame.width)
