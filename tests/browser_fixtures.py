@@ -29,7 +29,7 @@ from axe_playwright_python.base import AXE_SCRIPT
 from playwright.sync_api import Browser, BrowserContext, Page, Playwright, expect, sync_playwright
 from web_fakes import DESKTOP
 
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.telemetry.http_server import HttpServer
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

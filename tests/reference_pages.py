@@ -58,7 +58,7 @@ def pages() -> dict[Path, str]:
 _CONFIGURATION = """\
 # Configuration
 
-<!-- Made by `python tests/reference_pages.py` from bikeped/config/schema.py; change the
+<!-- Made by `python tests/reference_pages.py` from the sections in bikeped/config; change the
      descriptions there. -->
 
 Every key of `config.yaml`, in the order of the file. A key that is left out has its default. An

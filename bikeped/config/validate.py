@@ -9,7 +9,8 @@ from typing import Any
 
 import msgspec
 
-from bikeped.config.schema import Config, is_loopback, sections
+from bikeped.config.output_sections import is_loopback
+from bikeped.config.schema import Config, sections
 from bikeped.config.strict_yaml import one_line
 from bikeped.errors import ConfigError
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from bikeped.config.schema import FeedbackConfig
+from bikeped.config.output_sections import FeedbackConfig
 from bikeped.feedback.gpio import GpioLight, gpio_lamps
 from bikeped.feedback.light import Light, LightDriver, SimulatedLight
 from bikeped.feedback.usb import UsbLight, relay_lamps

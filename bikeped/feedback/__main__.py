@@ -16,7 +16,7 @@ from pathlib import Path
 
 import msgspec
 
-from bikeped.config.schema import FeedbackConfig
+from bikeped.config.output_sections import FeedbackConfig
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.feedback import open_light
 

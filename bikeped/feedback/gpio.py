@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from bikeped.config.schema import GpioConfig
+from bikeped.config.output_sections import GpioConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback.light import LAMP_COLOURS, Lamp, assign_lamps
 from bikeped.types import Colour

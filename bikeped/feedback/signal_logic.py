@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bikeped.config.schema import FeedbackConfig
+from bikeped.config.output_sections import FeedbackConfig
 from bikeped.faults import Effect, Fault
 from bikeped.types import Colour, Signal, Sound, State
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from bikeped.config.schema import SoundConfig
+from bikeped.config.output_sections import SoundConfig
 from bikeped.faults import Fault
 from bikeped.feedback.sounds import duration_s, load_wav, make_wav
 from bikeped.types import Sound

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-from bikeped.config.schema import UsbConfig
+from bikeped.config.output_sections import UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback.light import LAMP_COLOURS, Lamp, assign_lamps
 from bikeped.types import Colour

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from bikeped.config.schema import AuditConfig
+from bikeped.config.output_sections import AuditConfig
 from bikeped.errors import TelemetryError
 from bikeped.faults import Fault
 from bikeped.telemetry.builders import encode_line

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import msgspec
 
-from bikeped.config.schema import MqttConfig
+from bikeped.config.output_sections import MqttConfig
 from bikeped.telemetry.schema import ShownState
 
 

@@ -14,7 +14,7 @@ from aiohttp.http import HttpProcessingError
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.telemetry.schema import ShownState
 
 log = logging.getLogger(__name__)

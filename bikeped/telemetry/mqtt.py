@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bikeped import __version__
-from bikeped.config.schema import MqttConfig
+from bikeped.config.output_sections import MqttConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.homeassistant import discovery_messages
 from bikeped.telemetry.mqtt_connection import (

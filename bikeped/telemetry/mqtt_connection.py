@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from bikeped.config.schema import MqttConfig
+from bikeped.config.output_sections import MqttConfig
 from bikeped.errors import TelemetryError
 
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 from aiohttp import hdrs, web
 
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.pipeline.application import WebContext
 from bikeped.telemetry.latency import STAGES
 from bikeped.web.live_picture import PictureRenderer

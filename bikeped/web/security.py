@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 
 from aiohttp import hdrs, web
 
-from bikeped.config.schema import WebConfig, is_loopback
+from bikeped.config.output_sections import WebConfig, is_loopback
 from bikeped.errors import ConfigError
 from bikeped.telemetry.http_server import host_name
 

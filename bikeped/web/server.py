@@ -18,7 +18,7 @@ import msgspec
 from aiohttp import hdrs, web
 
 from bikeped import __version__
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.errors import BikepedError
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.templates import render

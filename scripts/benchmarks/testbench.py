@@ -97,7 +97,7 @@ class _Served:
         self._thread.join(30)
 
     async def _run(self) -> None:
-        from bikeped.config.schema import WebConfig
+        from bikeped.config.output_sections import WebConfig
         from bikeped.lab.testbench.pages import add_testbench
         from bikeped.telemetry.http_server import HttpServer
         from bikeped.web.security import load_access_policy

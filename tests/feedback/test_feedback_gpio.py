@@ -10,7 +10,7 @@ from typing import Any
 import gpiod
 import pytest
 
-from bikeped.config.schema import GpioConfig
+from bikeped.config.output_sections import GpioConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback.gpio import GpioLight
 from bikeped.types import Colour

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from bikeped.config.schema import FeedbackConfig, GpioConfig, UsbConfig
+from bikeped.config.output_sections import FeedbackConfig, GpioConfig, UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.faults import Fault
 from bikeped.feedback import check_light, light_driver, open_light

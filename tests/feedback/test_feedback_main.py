@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import bikeped.feedback.__main__ as darken
-from bikeped.config.schema import FeedbackConfig
+from bikeped.config.output_sections import FeedbackConfig
 from bikeped.errors import FeedbackError
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config.schema import FeedbackConfig
+from bikeped.config.output_sections import FeedbackConfig
 from bikeped.faults import Fault
 from bikeped.feedback.signal_logic import OFF, STARTING, SignalLogic, fault_signal
 from bikeped.types import Colour, Signal, Sound, State

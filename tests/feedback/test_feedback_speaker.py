@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bikeped.config.schema import SoundConfig
+from bikeped.config.output_sections import SoundConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback.sounds import make_wav
 from bikeped.feedback.speaker import Speaker

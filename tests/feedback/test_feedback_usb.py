@@ -11,7 +11,7 @@ import pytest
 import usb.backend
 import usb.core
 
-from bikeped.config.schema import UsbConfig
+from bikeped.config.output_sections import UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.feedback import usb as lights
 from bikeped.feedback.usb import UsbLight

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bikeped.config.schema import AuditConfig
+from bikeped.config.output_sections import AuditConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.builders import event_line, rfc3339
 from bikeped.telemetry.event_files import AuditLog, EventWriter

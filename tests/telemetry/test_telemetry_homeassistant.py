@@ -9,7 +9,7 @@ from typing import get_args
 import msgspec
 import pytest
 
-from bikeped.config.schema import MqttConfig
+from bikeped.config.output_sections import MqttConfig
 from bikeped.telemetry.homeassistant import discovery_messages, object_id
 from bikeped.telemetry.schema import HealthMessage, ShownState, StageLatency, StateMessage
 

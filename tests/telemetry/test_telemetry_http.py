@@ -15,7 +15,7 @@ from aiohttp import web
 from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
-from bikeped.config.schema import WebConfig, is_loopback
+from bikeped.config.output_sections import WebConfig, is_loopback
 from bikeped.telemetry.http_server import Health, HttpServer, add_monitoring, host_name, port_error
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.schema import Counters

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from bikeped.config.schema import MqttConfig
+from bikeped.config.output_sections import MqttConfig
 from bikeped.telemetry.mqtt import MqttPublisher
 
 FAST = (0.01, 0.05)  # seconds between attempts, so that tests do not wait

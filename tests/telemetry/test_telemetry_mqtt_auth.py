@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bikeped.config.schema import MqttConfig
+from bikeped.config.output_sections import MqttConfig
 from bikeped.errors import TelemetryError
 from bikeped.telemetry.mqtt import MqttPublisher
 from bikeped.telemetry.mqtt_connection import load_credentials, sends_password_in_clear

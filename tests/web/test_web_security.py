@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from web_fakes import LOCKED, OPEN, TOKEN
 
 from bikeped.config.load import parse_config
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.errors import ConfigError
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.web.security import (

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from web_fakes import OPEN
 
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.telemetry.http_server import HttpServer
 from bikeped.web.server import Page, add_page, json_answer, json_body, make_application, serve_pages

@@ -22,8 +22,9 @@ from msgspec import Meta
 from bikeped import __version__
 from bikeped.config.json_schema import key_descriptions
 from bikeped.config.load import LoadedConfig
+from bikeped.config.output_sections import Section
 from bikeped.config.provenance import DECIDING_CODE, code_hash
-from bikeped.config.schema import DecisionConfig, Section
+from bikeped.config.schema import DecisionConfig
 from bikeped.lab.experiments.optimizer import BOUNDS
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, Scenario, dump_scenario
 from bikeped.lab.simulation.suite import CONFIGURATIONS

@@ -19,7 +19,8 @@ from msgspec import Meta
 
 from bikeped.config.build import ground_camera
 from bikeped.config.load import LoadedConfig
-from bikeped.config.schema import DecisionConfig, Section
+from bikeped.config.output_sections import Section
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.experiments.latency import delay_frames

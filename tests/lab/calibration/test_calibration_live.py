@@ -16,7 +16,7 @@ from board_render import draw_picture
 from synthetic_boards import BoardPose, DrawnCamera, draw_views, spread_poses
 
 from bikeped.capture.base import FrameSource
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.geometry.lens import Lens
 from bikeped.lab.calibration.board_view import BoardPattern, BoardView

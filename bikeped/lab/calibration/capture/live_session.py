@@ -22,7 +22,7 @@ import numpy as np
 from aiohttp import hdrs, web
 
 from bikeped.capture.base import FrameSource
-from bikeped.config.schema import WebConfig
+from bikeped.config.output_sections import WebConfig
 from bikeped.errors import CalibrationError, CaptureError
 from bikeped.files import make_folder, write_whole
 from bikeped.lab.calibration.capture.guide import CaptureGuide, FrameStatus, FrameVerdict
