@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import random
 import threading
 import time
@@ -31,6 +32,8 @@ from bikeped.telemetry.mqtt_connection import (
 
 log = logging.getLogger(__name__)
 
+TURN_S = 0.1  #: longest time between two looks at what the broker sends
+
 
 @dataclass(frozen=True)
 class MqttStatus:
@@ -49,8 +52,9 @@ class MqttPublisher:
     """Publishes `bikeped/<site>/...` from a daemon thread; `publish` and `status` never block.
 
     `queue_size` bounds the messages that wait (not retained ones); `backoff_s` are the first and
-    the longest pause between two attempts, stretched by a jitter from `rng`; `io_timeout_s` is
-    how long one exchange with the broker may take before the connection is given up;
+    the longest pause between two attempts, shortened by a jitter from `rng`; `io_timeout_s` is how
+    long one exchange with the broker may take before the connection is given up, so a broker that
+    returns gets its first message within 10 s;
     `stop_timeout_s` bounds `stop`. Files in `config` are relative to `base_dir`.
 
     Raises TelemetryError when a file that `config` names cannot be used.
@@ -63,8 +67,8 @@ class MqttPublisher:
         base_dir: Path = Path(),
         version: str = __version__,
         queue_size: int = 64,
-        backoff_s: tuple[float, float] = (1.0, 60.0),
-        io_timeout_s: float = 10.0,
+        backoff_s: tuple[float, float] = (1.0, 4.0),
+        io_timeout_s: float = 5.0,
         stop_timeout_s: float = 2.0,
         rng: random.Random | None = None,
     ) -> None:
@@ -80,7 +84,6 @@ class MqttPublisher:
         self._stop_timeout_s = stop_timeout_s
         self._rng = rng or random.Random()
         self._thread: threading.Thread | None = None
-        self._connection: BrokerConnection | None = None
 
         self._changed = threading.Condition()  # guards all below
         self._queue: deque[MqttMessage] = deque()
@@ -88,6 +91,7 @@ class MqttPublisher:
         self._retained: dict[str, MqttMessage] = {}  #: newest value by topic
         self._unsent: dict[str, None] = {}  #: topics of `_retained` to send, in order
         self._stopping = self._connected = False
+        self._stop_by_s = math.inf  #: when a wait for the broker ends that `stop` interrupts
         self._error: str | None = None
         self._connects = self._published = self._dropped = self._superseded = 0
 
@@ -142,14 +146,12 @@ class MqttPublisher:
             return
         with self._changed:
             self._stopping = True
-            was_connected = self._connected
+            wait_s = self._stop_timeout_s if self._connected else 0.0
+            self._stop_by_s = time.monotonic() + wait_s
             self._changed.notify_all()
-        if was_connected:
-            self._thread.join(self._stop_timeout_s)
+        self._thread.join(wait_s)
         with self._changed:
             self._connected = False
-        if (connection := self._connection) is not None:
-            connection.abort()
 
     def _run(self) -> None:
         """Connects for ever, until stopped. Its errors are in `status`, never raised."""
@@ -180,7 +182,7 @@ class MqttPublisher:
         """One connection, from its attempt until it is lost (raises) or the publisher stops."""
         with contextlib.suppress(TelemetryError):  # an unusable file leaves the old credentials
             self._credentials = load_credentials(self.config, self._base_dir)
-        connection = self._connection = BrokerConnection(
+        connection = BrokerConnection(
             self.config,
             self._credentials,
             # One name a site makes the broker end a half-open older connection (and publish its
@@ -189,17 +191,11 @@ class MqttPublisher:
             client_id=f"bikeped-{self.config.site}",
             timeout_s=self._io_timeout_s,
             will=self._availability(b"offline"),
-            on_lost=self._wake,
+            cancelled=lambda: time.monotonic() >= self._stop_by_s,
         )
-        try:
+        with contextlib.closing(connection):
             connection.open()
             self._send(connection)
-        except BaseException:
-            connection.abort()
-            raise
-        finally:
-            self._connection = None
-            connection.close()
 
     def _send(self, connection: BrokerConnection) -> None:
         """Sends what waits, as it comes, until stopped; then says goodbye."""
@@ -207,20 +203,37 @@ class MqttPublisher:
             connection.publish(MqttMessage(topic, payload, 1, True))
         with self._changed:
             self._unsent = dict.fromkeys(self._retained)
-        while (message := self._next_retained()) is not None:
-            self._send_one(connection, message)
+        self._send_retained(connection)
         # Only now: who reads `online` finds values of this connection, not of an earlier one.
-        connection.publish(self._availability(b"online"))
+        connection.keep(self._availability(b"online"))
         with self._changed:
             self._connects += 1
             self._error = None
             self._connected = not self._stopping
         log.info("mqtt: connected to %s:%d", self.config.host, self.config.port)
-        while (message := self._next_message(connection)) is not None:
+        while not self._stopping:
+            connection.turn()
+            self._send_retained(connection)  # a change of state never waits behind tracks
+            with self._changed:
+                self._changed.wait_for(self._has_work, TURN_S)
+                message = self._queue.popleft() if self._queue and not self._unsent else None
+            if message is not None:
+                self._send_one(connection, message)
+        self._send_retained(connection)
+        connection.goodbye(self._availability(b"offline"))
+
+    def _has_work(self) -> bool:
+        return bool(self._unsent or self._queue or self._stopping)
+
+    def _send_retained(self, connection: BrokerConnection) -> None:
+        while True:
+            with self._changed:
+                if not self._unsent:
+                    return
+                topic = next(iter(self._unsent))
+                del self._unsent[topic]
+                message = self._retained[topic]
             self._send_one(connection, message)
-        while (message := self._next_retained()) is not None:
-            self._send_one(connection, message)
-        connection.publish(self._availability(b"offline"))
 
     def _send_one(self, connection: BrokerConnection, message: MqttMessage) -> None:
         try:
@@ -232,34 +245,8 @@ class MqttPublisher:
         with self._changed:
             self._published += 1
 
-    def _next_retained(self) -> MqttMessage | None:
-        with self._changed:
-            for topic in self._unsent:
-                del self._unsent[topic]
-                return self._retained[topic]
-        return None
-
-    def _next_message(self, connection: BrokerConnection) -> MqttMessage | None:
-        """Waits for something to send; None when the publisher stops or the connection is lost.
-
-        A change of state never waits behind a backlog of tracks.
-        """
-        with self._changed:
-            self._changed.wait_for(
-                lambda: self._unsent or self._queue or self._stopping or connection.lost
-            )
-            if self._stopping or connection.lost:
-                return None
-            if not self._unsent:
-                return self._queue.popleft()
-        return self._next_retained()
-
     def _availability(self, payload: bytes) -> MqttMessage:
         return MqttMessage(self._topic + "availability", payload, 1, True)
-
-    def _wake(self) -> None:
-        with self._changed:
-            self._changed.notify_all()
 
     def _set_failure(self, text: str) -> None:
         """Logs a failure once, until it changes or a connection comes between."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from paho.mqtt.publish import single
 
 from bikeped.config.output_sections import MqttConfig
 from bikeped.telemetry.mqtt import MqttPublisher
@@ -268,6 +269,31 @@ async def test_a_clean_goodbye_publishes_offline_once(broker, listen):
         await live.until(lambda got: got[-1][1] == b"online" and len(got) > 2)
         await stop(later)
     assert live.payloads("availability")[:3] == [b"online", b"offline", b"online"]
+
+
+async def test_a_forged_offline_is_corrected_but_our_own_stays(broker, listen):
+    mqtt = publisher(config(broker.port, "forgery"))
+    mqtt.start()
+    await connected(mqtt)
+    topic = "bikeped/forgery/availability"
+    async with listen(broker.port, topic) as live:
+        await live.until(lambda got: len(got) == 1)
+        await asyncio.to_thread(
+            single, topic, b"offline", 1, True, hostname="127.0.0.1", port=broker.port
+        )
+        await live.until(lambda got: len(got) == 3)
+        assert live.payloads("availability") == [b"online", b"offline", b"online"]
+        await stop(mqtt)
+        await live.until(lambda got: len(got) == 4)
+    async with listen(broker.port, topic) as late:
+        await late.until(lambda got: len(got) == 1)
+    assert late.received == [(topic, b"offline", True)]
+
+
+def test_a_broker_that_returns_is_tried_within_ten_seconds():
+    mqtt = MqttPublisher(config(1, "returns"))
+    longest_s = max(mqtt._pause_s(attempt) for attempt in range(1000))
+    assert mqtt._io_timeout_s + longest_s < 10.0  # an attempt that just fails, and its pause
 
 
 async def test_an_absent_broker_is_logged_once_and_tried_again(caplog, make_broker):
