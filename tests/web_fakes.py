@@ -15,9 +15,15 @@ from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.detection_scheduler import DecodedFrame
 from bikeped.pipeline.loop import FrameResult
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.builders import health_message
+from bikeped.telemetry.builders import rfc3339
 from bikeped.telemetry.mqtt import MqttStatus
-from bikeped.telemetry.schema import ComponentStatus, Counters, HealthMessage
+from bikeped.telemetry.schema import (
+    CameraHealth,
+    ComponentStatus,
+    Counters,
+    HealthMessage,
+    StageLatency,
+)
 from bikeped.types import Colour, Detections, Frame, Kind, Signal
 from bikeped.web.security import AccessPolicy
 
@@ -66,18 +72,18 @@ def web_context(loaded: LoadedConfig | None = None, mqtt: MqttStatus | None = No
 
 def health(**changes: Any) -> HealthMessage:
     values: dict[str, Any] = {
-        "unix_s": 1.7e9,
+        "timestamp": rfc3339(1.7e9),
         "state": "SAFE",
         "version": "0.1",
         "config_hash": "abc",
         "uptime_s": 3725.0,
         "fps": 29.9,
-        "latency_ms": {"total": {"p50": 12.0, "p95": 20.0, "p99": 30.0, "max": 44.0}},
-        "camera": ComponentStatus(ok=True, detail="frames arrive"),
-        "capture_age_ms": 23.0,
+        "latency_ms": {"total": StageLatency(p50=12.0, p95=20.0, p99=30.0, max=44.0)},
+        "camera": CameraHealth(ok=True, detail="frames arrive", capture_age_ms=23.0),
         "detector": ComponentStatus(ok=True, detail="answers"),
         "light": ComponentStatus(ok=True, detail="simulated"),
-        "faults": (),
+        "faults": [],
+        "fault_codes": [],
         "counters": Counters(
             received=112,
             frames=100,
@@ -90,7 +96,7 @@ def health(**changes: Any) -> HealthMessage:
             audit_dropped=0,
         ),
     }
-    return health_message(**{**values, **changes})
+    return HealthMessage(**{**values, **changes})
 
 
 def picture(grey: int = 90, width: int = 960, height: int = 640) -> bytes:

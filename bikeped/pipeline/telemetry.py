@@ -18,19 +18,22 @@ from bikeped.feedback.light import LightDriver
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.builders import (
-    encode,
-    event_line,
-    health_message,
-    state_message,
-    tracks_message,
-)
+from bikeped.telemetry.builders import encode, event_line, json_number, rfc3339, tracks_message
 from bikeped.telemetry.event_files import AuditLog
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.mqtt import MqttPublisher
-from bikeped.telemetry.schema import ComponentStatus, Counters, EventLine, HealthMessage, ShownState
-from bikeped.types import Decision, Signal, State
+from bikeped.telemetry.schema import (
+    CameraHealth,
+    ComponentStatus,
+    Counters,
+    EventLine,
+    HealthMessage,
+    ShownState,
+    StageLatency,
+    StateMessage,
+)
+from bikeped.types import Decision, Signal
 
 log = logging.getLogger(__name__)
 
@@ -101,11 +104,14 @@ class Telemetry:
         before, self._shown = self._shown, shown
         if shown == before or self._mqtt is None:
             return
-        message = state_message(
-            decision or Decision(0.0, State.IDLE, sentence),
-            since_unix_s=self._wall(),
+        # A pair belongs to a decision, so FAULT and OFF carry none.
+        pair = decision.pair if decision and signal.name not in ("FAULT", "OFF") else None
+        message = StateMessage(
+            state=_shown(signal),
+            since=rfc3339(self._wall()),
+            pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
+            distance_m=None if pair is None else json_number(pair.distance_m, 3),
             config_hash=self.loaded.hash,
-            shown=_shown(signal),
             sentence=sentence,
         )
         self._mqtt.publish("state", encode(message), retain=True, qos=self.loaded.config.mqtt.qos)
@@ -123,19 +129,29 @@ class Telemetry:
         age_ms = None if age_s is None else age_s * 1e3
         if age_ms is None and self._last is not None:
             age_ms = self._last.latency_ms["capture_age"]
-        return health_message(
-            unix_s=self._wall(),
+        camera = _status("camera", faults, "frames arrive")
+        return HealthMessage(
+            timestamp=rfc3339(self._wall()),
             state=_shown(signal) if signal else "FAULT",
             version=__version__,
             config_hash=self.loaded.hash,
-            uptime_s=self._clock() - self._started_s,
+            uptime_s=round(self._clock() - self._started_s, 1),
             fps=self.fps(),
-            latency_ms=self.times.percentiles(),
-            camera=_status("camera", faults, "frames arrive"),
-            capture_age_ms=age_ms,
+            latency_ms={
+                stage: StageLatency(
+                    **{key: round(row[key], 2) for key in StageLatency.__struct_fields__}
+                )
+                for stage, row in self.times.percentiles().items()
+            },
+            camera=CameraHealth(
+                ok=camera.ok,
+                detail=camera.detail,
+                capture_age_ms=None if age_ms is None else json_number(age_ms, 1),
+            ),
             detector=_status("detector", faults, "answers"),
             light=_status("light", faults, light),
-            faults=faults,
+            faults=list(fault_texts(faults)),
+            fault_codes=[fault.code for fault in faults],
             counters=self._counters(loop),
         )
 

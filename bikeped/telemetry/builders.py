@@ -1,4 +1,4 @@
-"""Builds every MQTT payload and every event line of the types in `schema`. Pure.
+"""Builds the tracks message and event lines of the types in `schema`, and encodes all. Pure.
 
 Positions are rounded to a millimetre, so that files read well and two replays of one recording
 agree byte for byte. Only `latency_ms` and `started_at` differ between two runs; they come
@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import TelemetryError
-from bikeped.faults import Fault, fault_texts
 from bikeped.telemetry import schema as messages
 from bikeped.telemetry.schema import EventHeader, EventLine, EventTrack, KindLabel, ShownState
 from bikeped.types import Decision, Detections, FloatArray, Kind, KindArray, Tracks
@@ -99,74 +98,6 @@ def track_records(tracks: Tracks) -> list[EventTrack]:
     ]
 
 
-def state_message(
-    decision: Decision,
-    *,
-    since_unix_s: float,
-    config_hash: str,
-    shown: ShownState | None = None,
-    sentence: str | None = None,
-) -> messages.StateMessage:
-    """The state message: what the light shows since `since_unix_s` (seconds since 1970).
-
-    `shown` and `sentence` replace the decision's own where the light says something else: FAULT
-    with its cause, or OFF. A pair belongs to a decision, so FAULT and OFF carry none.
-    """
-    state = shown or _state(decision)
-    pair = None if state in ("FAULT", "OFF") else decision.pair
-    return messages.StateMessage(
-        state=state,
-        since=rfc3339(since_unix_s),
-        pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
-        distance_m=None if pair is None else _number(pair.distance_m, 3),
-        config_hash=config_hash,
-        sentence=decision.sentence if sentence is None else sentence,
-    )
-
-
-def health_message(
-    *,
-    unix_s: float,
-    state: ShownState,
-    version: str,
-    config_hash: str,
-    uptime_s: float,
-    fps: float,
-    latency_ms: Mapping[str, Mapping[str, float]],
-    camera: messages.ComponentStatus,
-    capture_age_ms: float | None,
-    detector: messages.ComponentStatus,
-    light: messages.ComponentStatus,
-    faults: Sequence[Fault],
-    counters: messages.Counters,
-) -> messages.HealthMessage:
-    """The health message at `unix_s`; `latency_ms` is what `StageTimes.percentiles` returns."""
-    return messages.HealthMessage(
-        timestamp=rfc3339(unix_s),
-        state=state,
-        version=version,
-        config_hash=config_hash,
-        uptime_s=_number(uptime_s, 1) or 0.0,
-        fps=_number(fps, 2) or 0.0,
-        latency_ms={
-            stage: messages.StageLatency(
-                **{key: _number(row[key], 2) or 0.0 for key in ("p50", "p95", "p99", "max")}
-            )
-            for stage, row in latency_ms.items()
-        },
-        camera=messages.CameraHealth(
-            ok=camera.ok,
-            detail=camera.detail,
-            capture_age_ms=None if capture_age_ms is None else _number(capture_age_ms, 1),
-        ),
-        detector=detector,
-        light=light,
-        faults=list(fault_texts(faults)),
-        fault_codes=[fault.code for fault in faults],
-        counters=counters,
-    )
-
-
 def event_line(
     *,
     t_s: float,
@@ -184,7 +115,7 @@ def event_line(
     """
     pair = decision.pair
     return EventLine(
-        t=_number(t_s, 4) or 0.0,
+        t=json_number(t_s, 4) or 0.0,
         frame=frame,
         state=_state(decision),
         light=light or _state(decision),
@@ -200,7 +131,7 @@ def event_line(
             )
         ],
         sentence=decision.sentence,
-        latency_ms={stage: _number(ms, 3) or 0.0 for stage, ms in latency_ms.items()},
+        latency_ms={stage: json_number(ms, 3) or 0.0 for stage, ms in latency_ms.items()},
     )
 
 
@@ -268,6 +199,6 @@ def _points(values: Sequence[Sequence[float]] | FloatArray) -> list[tuple[float,
     return [(x, y) for x, y in _rounded(array[np.isfinite(array).all(axis=1)], 3)]
 
 
-def _number(value: float, decimals: int) -> float | None:
+def json_number(value: float, decimals: int) -> float | None:
     """`value` rounded, or None where JSON has no number for it."""
     return round(float(value), decimals) + 0.0 if math.isfinite(value) else None

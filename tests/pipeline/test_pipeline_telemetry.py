@@ -16,8 +16,9 @@ from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.telemetry import Telemetry, health_line, report_health
 from bikeped.telemetry.builders import encode
+from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
-from bikeped.types import Colour, Kind, Signal
+from bikeped.types import Colour, Decision, Kind, PairMetrics, Signal, State
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
 
@@ -108,6 +109,57 @@ async def test_the_state_message_of_an_alert_has_that_frames_pair():
         for _ in range(2):
             rig.telemetry.measure(rig.loop)
         assert rig.metrics.registry.get_sample_value("bikeped_alerts_total") == 1
+
+
+def test_state_message_exactly():
+    pair = PairMetrics(
+        cyclist_id=7,
+        pedestrian_id=3,
+        distance_m=4.56789,
+        distance_then_m=6.0,
+        lookback_s=0.5,
+        displacement_m=2.0,
+        speed_mps=4.0,
+        d_min_m=1.0,
+        d_max_m=8.0,
+    )
+    rig = TelemetryRig()
+    publisher = Publisher()
+    telemetry = Telemetry(
+        rig.config, rig.track_and_decide, publisher=publisher, wall_clock=Clock(1_767_268_800.0)
+    )
+    sentence = "Cyclist 7 comes towards pedestrian 3."
+    decision = Decision(1.0, State.ALERT, sentence, pair)
+    telemetry.on_signal(Signal("ALERT", Colour.RED), sentence, decision)
+    telemetry.on_signal(Signal("FAULT", Colour.ORANGE), "s", decision)
+    telemetry.on_signal(Signal("OFF", Colour.OFF), "o", None)
+    alert, fault, off = publisher.of("state")
+    assert alert == {
+        "state": "ALERT",
+        "since": "2026-01-01T12:00:00.000Z",
+        "pair": [7, 3],
+        "distance_m": 4.568,
+        "config_hash": rig.config.hash,
+        "sentence": sentence,
+    }
+    assert (fault["state"], fault["pair"], fault["distance_m"]) == ("FAULT", None, None)
+    assert fault["sentence"] == "s"
+    assert (off["state"], off["pair"], off["distance_m"]) == ("OFF", None, None)
+
+
+async def test_health_message_keys_and_rounding():
+    async with TelemetryRig() as rig:
+        await rig.well()
+        rig.telemetry.times = StageTimes()
+        rig.telemetry.times.add({"total": 1.23456})
+        rig.interval.now_s += 12.3456
+        health = valid("health", encode(rig.telemetry.health(rig.loop, "simulated")))
+        assert {"fps", "latency_ms", "camera", "detector", "light", "faults"} <= health.keys()
+        assert health["latency_ms"] == {
+            "total": {"p50": 1.23, "p95": 1.23, "p99": 1.23, "max": 1.23}
+        }
+        for value in (health["uptime_s"], health["camera"]["capture_age_ms"]):
+            assert value == round(value, 1)
 
 
 async def test_tracks_come_at_the_interval_with_the_time_of_capture():
