@@ -15,7 +15,7 @@ import random
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bikeped import __version__
@@ -35,17 +35,17 @@ log = logging.getLogger(__name__)
 TURN_S = 0.1  #: longest time between two looks at what the broker sends
 
 
-@dataclass(frozen=True)
+@dataclass
 class MqttStatus:
     """State of the publisher; the counts are totals since it was made."""
 
-    connected: bool
-    error: str | None  #: why it is not connected, one line; None while it is, or before it tried
-    connects: int
-    published: int
-    dropped: int  #: messages that never reached the broker, queue overflow included
-    superseded: int  #: retained values replaced by a newer one before they could be sent
-    queued: int
+    connected: bool = False
+    error: str | None = None  #: why it is not connected; None while it is, or before it tried
+    connects: int = 0
+    published: int = 0
+    dropped: int = 0  #: messages that never reached the broker, queue overflow included
+    superseded: int = 0  #: retained values replaced by a newer one before they could be sent
+    queued: int = 0
 
 
 class MqttPublisher:
@@ -90,24 +90,15 @@ class MqttPublisher:
         self._queue_size = queue_size
         self._retained: dict[str, MqttMessage] = {}  #: newest value by topic
         self._unsent: dict[str, None] = {}  #: topics of `_retained` to send, in order
-        self._stopping = self._connected = False
+        self._status = MqttStatus()
+        self._stopping = False
         self._stop_by_s = math.inf  #: when a wait for the broker ends that `stop` interrupts
-        self._error: str | None = None
-        self._connects = self._published = self._dropped = self._superseded = 0
 
     @property
     def status(self) -> MqttStatus:
         """The publisher's present state."""
         with self._changed:
-            return MqttStatus(
-                connected=self._connected,
-                error=self._error,
-                connects=self._connects,
-                published=self._published,
-                dropped=self._dropped,
-                superseded=self._superseded,
-                queued=len(self._queue),
-            )
+            return replace(self._status, queued=len(self._queue))
 
     def publish(
         self, topic_suffix: str, payload: bytes, *, retain: bool = False, qos: int | None = None
@@ -124,13 +115,13 @@ class MqttPublisher:
         with self._changed:
             if retain:
                 if message.topic in self._unsent:
-                    self._superseded += 1
+                    self._status.superseded += 1
                 self._retained[message.topic] = message
                 self._unsent[message.topic] = None
             else:
                 if len(self._queue) >= self._queue_size:
                     self._queue.popleft()
-                    self._dropped += 1
+                    self._status.dropped += 1
                 self._queue.append(message)
             self._changed.notify_all()
 
@@ -146,12 +137,12 @@ class MqttPublisher:
             return
         with self._changed:
             self._stopping = True
-            wait_s = self._stop_timeout_s if self._connected else 0.0
+            wait_s = self._stop_timeout_s if self._status.connected else 0.0
             self._stop_by_s = time.monotonic() + wait_s
             self._changed.notify_all()
         self._thread.join(wait_s)
         with self._changed:
-            self._connected = False
+            self._status.connected = False
 
     def _run(self) -> None:
         """Connects for ever, until stopped. Its errors are in `status`, never raised."""
@@ -207,9 +198,9 @@ class MqttPublisher:
         # Only now: who reads `online` finds values of this connection, not of an earlier one.
         connection.keep(self._availability(b"online"))
         with self._changed:
-            self._connects += 1
-            self._error = None
-            self._connected = not self._stopping
+            self._status.connects += 1
+            self._status.error = None
+            self._status.connected = not self._stopping
         log.info("mqtt: connected to %s:%d", self.config.host, self.config.port)
         while not self._stopping:
             connection.turn()
@@ -240,10 +231,10 @@ class MqttPublisher:
             connection.publish(message)
         except OSError:
             with self._changed:
-                self._dropped += not message.retain  # a retained value is sent again
+                self._status.dropped += not message.retain  # a retained value is sent again
             raise
         with self._changed:
-            self._published += 1
+            self._status.published += 1
 
     def _availability(self, payload: bytes) -> MqttMessage:
         return MqttMessage(self._topic + "availability", payload, 1, True)
@@ -251,10 +242,10 @@ class MqttPublisher:
     def _set_failure(self, text: str) -> None:
         """Logs a failure once, until it changes or a connection comes between."""
         with self._changed:
-            self._connected = False
-            if self._stopping or text == self._error:
+            self._status.connected = False
+            if self._stopping or text == self._status.error:
                 return
-            self._error = text
+            self._status.error = text
         log.warning("mqtt: %s; trying again, messages are dropped meanwhile", text)
 
     def _explain(self, exc: OSError) -> str:
