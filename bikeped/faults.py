@@ -78,6 +78,9 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _stops("camera.error", "camera", "The camera cannot be opened or read."),
         _stops("camera.undecodable", "camera", "Frames arrive, but none can be decoded."),
         _stops("camera.frame_size", "camera", "The frame does not fit the configured camera."),
+        _stops(
+            "camera.moved", "camera", "The camera has moved since it was aligned; align it again."
+        ),
         _ends("camera.hang", "camera", "A read has not returned for camera.hang_after_s."),
         _stops("detector.no_answer", "detector", "No answer for detection.silent_after_s."),
         _stops("detector.future_time", "detector", "The newest answer's time is in the future."),
@@ -106,6 +109,7 @@ FAULT_KINDS: dict[str, FaultKind] = {
             severity=Severity.CRITICAL,
             clears=Clears.RESTART,
         ),
+        _minor("camera.moved_slightly", "camera", "The camera has moved a little; align it again."),
         _minor("speaker.error", "speaker", "A sound could not be played."),
         _minor("audit.error", "audit", "The audit log cannot be written."),
     )

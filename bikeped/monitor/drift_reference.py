@@ -8,19 +8,17 @@ but these patches is stored.
 
 from __future__ import annotations
 
-import io
-import json
 import math
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.errors import GeometryError
+from bikeped.errors import BikepedError, GeometryError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import Lens
@@ -38,7 +36,7 @@ _MIN_CONTRAST = 1.0  #: root mean square of the gradient in a patch, grey levels
 _MIN_SAMENESS = 0.7  #: correlation of a patch between the pictures of a reference
 #: Ground farther than GROUND_M, and all that is not ground, is FAR_M away: it shows no parallax.
 GROUND_M, FAR_M = 20.0, 60.0
-FORMAT = "bikeped camera reference 1"
+FORMAT: Literal["bikeped camera reference 1"] = "bikeped camera reference 1"
 
 
 @dataclass(frozen=True)
@@ -46,72 +44,71 @@ class DriftReference:
     """What a camera saw where it was aligned.
 
     `camera` and `framing` are those of the alignment. `uv_px` [n, 2]: the patches' middles in
-    sensor pixels; `ray` [n, 3]: unit directions in ground axes; `ground_m` [n, 2]: their places on
-    the ground, NaN where they are above it or farther than `GROUND_M`; `patches` [n, levels, 11,
-    11]: edge strength, finest level first; `sharpness`: mean gradient of the pictures, grey levels.
+    sensor pixels; `ground_m` [n, 2]: their places on the ground, NaN where they are above it or
+    farther than `GROUND_M`; `patches` [n, levels, 11, 11]: edge strength, finest level first;
+    `sharpness`: mean gradient of the pictures, grey levels a pixel.
     """
 
     camera: GroundCamera
     framing: Framing
     uv_px: FloatArray
-    ray: FloatArray
     ground_m: FloatArray
     patches: Float32Array
     sharpness: float
 
-    def to_bytes(self) -> bytes:
-        """The content of a reference file: a .npz of the arrays and the camera's numbers."""
-        file = io.BytesIO()
+    def to_json(self) -> bytes:
+        """The content of a reference file."""
         lens = {f.name: getattr(self.camera.lens, f.name) for f in fields(Lens) if f.init}
         camera = {f.name: getattr(self.camera, f.name) for f in fields(GroundCamera) if f.init}
-        about = {
-            "format": FORMAT,
-            "camera": {**camera, "lens": lens},
-            "framing": {f.name: getattr(self.framing, f.name) for f in fields(Framing)},
-            "sharpness": self.sharpness,
-        }
-        np.savez_compressed(
-            file,
-            about=np.array(json.dumps(about)),
-            uv_px=self.uv_px,
-            ray=self.ray,
-            ground_m=self.ground_m,
-            patches=self.patches.astype(np.float16),
+        [None if math.isnan(x) else (x, y) for x, y in self.ground_m.tolist()]
+        ground = [None if math.isnan(x) else (x, y) for x, y in self.ground_m.tolist()]
+        return msgspec.json.encode(
+            _File(
+                format=FORMAT,
+                camera={**camera, "lens": lens},
+                framing=self.framing,
+                sharpness=self.sharpness,
+                uv_px=self.uv_px.tolist(),
+                ground_m=ground,
+                patches=self.patches.astype("<f2").tobytes(),
+                complete=True,
+            )
         )
-        return file.getvalue()
 
     @staticmethod
-    def from_bytes(content: bytes, name: str) -> DriftReference:
+    def from_json(content: bytes, name: str) -> DriftReference:
         """The reference of a file's content; `name` for messages. GeometryError when it is none."""
         try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as file:
-                about: dict[str, Any] = json.loads(str(file["about"]))
-                if about["format"] != FORMAT:
-                    raise ValueError(f"format {about['format']!r}")
-                arrays = {k: file[k].astype(np.float64) for k in ("uv_px", "ray", "ground_m")}
-                patches = file["patches"].astype(np.float32)
-            plain = about["camera"]
-            lens = Lens(**{**plain["lens"], "k": tuple(plain["lens"]["k"])})
-            window = plain["window_px"]
-            camera = GroundCamera(
-                **{**plain, "lens": lens, "window_px": None if window is None else tuple(window)}
-            )
-            n, side = len(patches), PATCH_PX + 2
-            shapes = {k: v.shape for k, v in arrays.items()}
-            if shapes != {"uv_px": (n, 2), "ray": (n, 3), "ground_m": (n, 2)}:
-                raise ValueError(f"shapes {shapes}")
-            if patches.shape[2:] != (side, side) or not np.isfinite(patches).all() or n < 1:
-                raise ValueError(f"patches of shape {patches.shape}")
-            framing = Framing(**about["framing"])
-            if patches.shape[1] != len(levels_of(camera, framing)):
-                raise ValueError(f"{patches.shape[1]} levels")
-            return DriftReference(
-                camera, framing, patches=patches, sharpness=float(about["sharpness"]), **arrays
-            )
-        except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+            file = msgspec.json.decode(content, type=_File)
+            lens = msgspec.convert(file.camera.pop("lens"), dict[str, Any])
+            camera: dict[str, Any] = {
+                k: tuple(v) if isinstance(v, list) else v for k, v in file.camera.items()
+            }
+            made = GroundCamera(Lens(**{**lens, "k": tuple(lens["k"])}), **camera)
+            shape = len(file.uv_px), len(levels_of(made, file.framing)), PATCH_PX + 2, PATCH_PX + 2
+            patches = np.frombuffer(file.patches, "<f2").astype(np.float32).reshape(shape)
+            nowhere = (math.nan, math.nan)
+            ground = [nowhere if place is None else place for place in file.ground_m]
+            if len(ground) != shape[0] or shape[0] < MIN_PATCHES or not np.isfinite(patches).all():
+                raise ValueError(f"{shape[0]} places")
+        except (msgspec.MsgspecError, BikepedError, ValueError, KeyError, TypeError) as error:
             raise GeometryError(
                 f"{name}: is not a camera reference ({error}); align the camera again"
             ) from error
+        return DriftReference(
+            made, file.framing, np.array(file.uv_px), np.array(ground), patches, file.sharpness
+        )
+
+
+class _File(msgspec.Struct):
+    format: Literal["bikeped camera reference 1"]
+    camera: dict[str, Any]
+    framing: Framing
+    sharpness: float
+    uv_px: list[tuple[float, float]]
+    ground_m: list[tuple[float, float] | None]
+    patches: bytes  #: base64 of float16, little-endian
+    complete: Literal[True]  #: the last word: a file that was cut off has none
 
 
 def levels_of(camera: GroundCamera, framing: Framing) -> list[tuple[int, int]]:
@@ -129,10 +126,10 @@ def levels_of(camera: GroundCamera, framing: Framing) -> list[tuple[int, int]]:
 
 def reduced(picture: ImageArray, size: tuple[int, int]) -> ImageArray:
     """The picture ([h, w] grey or [h, w, 3] RGB) as a grey one of `size` (width, height)."""
-    if (picture.shape[1], picture.shape[0]) != size:
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
     if picture.ndim == 3:
         picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+    if (picture.shape[1], picture.shape[0]) != size:
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
     return picture
 
 
@@ -188,18 +185,17 @@ def make_reference(
             grey = np.asarray(cv2.pyrDown(grey), np.uint8)
     view = framing.for_frame(*sizes[0])
     uv = _places(mean, camera, view)
-    finest = [normalised(sampled(one, uv[:, None] + COMPARED))[0] for one in stacks[0]]
-    middle = normalised(np.asarray(np.mean(finest, axis=0)))[0]
-    same = np.min([np.einsum("ks,ks->k", middle, one) for one in finest], axis=0)
-    uv = uv[same >= _MIN_SAMENESS][:MAX_PATCHES]
+    if len(uv):
+        finest = [normalised(sampled(one, uv[:, None] + COMPARED))[0] for one in stacks[0]]
+        middle = normalised(np.asarray(np.mean(finest, axis=0)))[0]
+        same = np.min([np.einsum("ks,ks->k", middle, one) for one in finest], axis=0)
+        uv = uv[same >= _MIN_SAMENESS][:MAX_PATCHES]
     if len(uv) < MIN_PATCHES:
         raise GeometryError(
             f"camera reference: only {len(uv)} places can be recognised in the picture, "
             f"{MIN_PATCHES} are needed; use a picture by day, or one with fewer road users"
         )
-    crop = view.frame_to_crop(uv)
-    ray = camera.rays(crop)
-    ground, down = camera.ground(crop)
+    ground, down = camera.ground(view.frame_to_crop(uv))
     near = down & (np.hypot(ground[:, 0], ground[:, 1]) < GROUND_M)
     patches = [
         sampled(np.asarray(np.mean(stack, axis=0), np.float32), uv[:, None] / 2**level + _STORED)
@@ -209,7 +205,6 @@ def make_reference(
         camera,
         framing,
         uv_px=uv * view.scale,
-        ray=ray,
         ground_m=np.where(near[:, None], ground, np.nan),
         patches=np.stack(patches, axis=1).reshape(len(uv), len(sizes), PATCH_PX + 2, PATCH_PX + 2),
         sharpness=sharpness,
@@ -220,19 +215,22 @@ def _places(mean: Float32Array, camera: GroundCamera, view: Framing) -> FloatArr
     """Pixels [n, 2] that are easy to recognise, best first, spread over what is worth watching."""
     height, width = mean.shape
     smooth = cv2.GaussianBlur(mean, (0, 0), 0.8)
-    gradient = cv2.magnitude(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
-                             cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8))
-    contrast = np.sqrt(np.maximum(cv2.blur(gradient * gradient, (7, 7)), 0))
+    gradient = cv2.magnitude(
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
+        cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8),
+    )
+    contrast = np.sqrt(np.maximum(cv2.blur(np.square(gradient), (7, 7)), 0))
     corner = np.sqrt(np.maximum(cv2.cornerMinEigenVal(smooth, 7), 0))
-    score = corner / max(float(corner.max()), 1e-6) + 0.1 * contrast / max(float(contrast.max()), 1e-6)
+    score = corner / max(float(corner.max()), 1e-6)
+    score += 0.1 * contrast / max(float(contrast.max()), 1e-6)
     uv = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     crop, margin = view.frame_to_crop(uv), (PATCH_PX / 2 + 2) * view.scale
+    low, high = np.array(view.window_px[:2]) + margin, np.array(view.window_px[2:]) - margin
+    rim = camera.lens.max_radius_px
+    good = (contrast > _MIN_CONTRAST) & (crop > low).all(axis=-1) & (crop < high).all(axis=-1)
     radius = np.hypot(crop[..., 0] - camera.cx, crop[..., 1] - camera.cy)
-    ray = camera.rays(crop)
-    u0, v0, u1, v1 = view.window_px
-    good = (contrast > _MIN_CONTRAST) & (ray[..., 2] < math.sin(math.radians(_MAX_ELEVATION_DEG)))
-    good &= radius < min(camera.lens.max_radius_px * _MAX_RADIUS, camera.lens.max_radius_px - margin)
-    good &= (crop > (u0 + margin, v0 + margin)).all(-1) & (crop < (u1 - margin, v1 - margin)).all(-1)
+    good &= radius < min(rim * _MAX_RADIUS, rim - margin)
+    good &= camera.rays(crop)[..., 2] < math.sin(math.radians(_MAX_ELEVATION_DEG))
     score = np.where(good, score, 0)
     best = []
     for top in range(0, height, _CELL_PX):
