@@ -29,6 +29,7 @@ def test_every_row_is_consistent(kind):
         assert (kind.effect, kind.clears) in (
             (Effect.FAULT, Clears.GOOD_FRAMES),
             (Effect.WITHHELD, Clears.AT_ONCE),
+            (Effect.NOTICE, Clears.AT_ONCE),
         )
 
 
