@@ -106,6 +106,7 @@ def test_a_turn_is_measured_in_other_traffic(angles: dict[str, float]) -> None:
         ({"pitch_deg": 0.3}, False, False),
         ({"pitch_deg": 1.0}, False, True),
         ({"pitch_deg": 2.0}, True, False),
+        ({"pitch_deg": -2.0}, True, False),
         ({"roll_deg": 2.0}, True, False),
         ({"heading_deg": 2.5}, False, True),
         ({"heading_deg": 5.0}, True, False),
