@@ -28,7 +28,7 @@ from bikeped.types import BoolArray, Float32Array, FloatArray
 #: What makes a fit count: share of the patches in view, their number, standard error of the turn.
 _MIN_MATCH, _MIN_INLIERS, _MAX_SIGMA_DEG = 0.2, 12, 0.15
 _MATCHES, _OFF_PX = 0.6, 1.0  #: correlation and distance of a patch that matches
-_SIGMA_PX, _SHIFT_SIGMA_M = 0.4, 0.15  #: of a patch's place; of the shift before it is measured
+_SIGMA_PX, _SHIFT_SIGMA_M = 0.4, 0.08  #: of a patch's place; of the shift before it is measured
 
 
 @dataclass(frozen=True)

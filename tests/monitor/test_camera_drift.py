@@ -18,7 +18,12 @@ from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import Lens
 from bikeped.lab.rendering import Conditions, ScenePainter
 from bikeped.lab.rendering.dataset import random_scenario
-from bikeped.lab.rendering.render_camera import DEFAULT_POSE, SceneCamera, lens_camera
+from bikeped.lab.rendering.render_camera import (
+    DEFAULT_POSE,
+    SceneCamera,
+    lens_camera,
+    rectilinear_camera,
+)
 from bikeped.monitor.camera_drift import Drift, DriftCheck, misplaced_m
 from bikeped.monitor.drift_reference import DriftReference, make_reference
 from bikeped.monitor.patch_fit import Pose, rotation
@@ -139,12 +144,26 @@ def test_a_lower_camera_misplaces_the_ground() -> None:
     assert drift.moved_slightly
 
 
-def test_a_camera_shifted_along_the_street() -> None:
-    pose = CameraPose(DEFAULT_POSE.x_m + 0.4, DEFAULT_POSE.y_m, DEFAULT_POSE.heading_deg)
-    drift = checked(street(2, scene=replace(SCENE, pose=pose)))
+@pytest.mark.parametrize("east_m", [0.4, -0.4])
+def test_a_camera_shifted_along_the_street(east_m: float) -> None:
+    pose = replace(DEFAULT_POSE, x_m=DEFAULT_POSE.x_m + east_m)
+    check = DriftCheck(reference(), CAMERA, FRAMING)
+    assert shown(check, street(2)).metres_at_10m < 0.1
+    # What is near has gone out of reach of the quick fit: the one from coarse pictures finds it.
+    drift = shown(check, street(2, scene=replace(SCENE, pose=pose)), 20, 10.0)
     assert drift.judged
-    assert drift.metres_at_10m == pytest.approx(0.4, abs=0.15)
+    assert drift.metres_at_10m == pytest.approx(0.4, abs=0.12)
     assert drift.moved_slightly
+
+
+def test_roll_counts_where_a_narrow_view_hides_it() -> None:
+    scene = rectilinear_camera(60, (WIDTH, HEIGHT), pitch_deg=-20)
+    made = make_reference([street(1, scene=scene)], scene.camera, scene.framing)
+    check = DriftCheck(made, scene.camera, scene.framing)
+    drift = shown(check, rolled(street(2, scene=scene), 2.1, cv2.BORDER_REPLICATE))
+    assert drift.metres_at_10m < 0.9
+    assert drift.roll_deg == pytest.approx(2.1, abs=0.1)
+    assert drift.moved
 
 
 def shifted_up(picture: ImageArray, border: int) -> ImageArray:
@@ -194,6 +213,7 @@ def test_verdicts_stay_in_the_dark_and_end_when_the_camera_is_back() -> None:
     assert dark.moved
     assert not dark.judged
     assert dark.inliers == 0
+    assert dark.pitch_deg == pytest.approx(3.0, abs=0.15)
     assert not shown(check, street(2), 10, 50.0).moved
 
 
