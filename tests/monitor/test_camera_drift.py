@@ -144,7 +144,7 @@ def test_a_lower_camera_misplaces_the_ground() -> None:
     assert drift.moved_slightly
 
 
-@pytest.mark.parametrize("east_m", [0.4, -0.4])
+@pytest.mark.parametrize("east_m", [0.6, -0.6])
 def test_a_camera_shifted_along_the_street(east_m: float) -> None:
     pose = replace(DEFAULT_POSE, x_m=DEFAULT_POSE.x_m + east_m)
     check = DriftCheck(reference(), CAMERA, FRAMING)
@@ -152,7 +152,7 @@ def test_a_camera_shifted_along_the_street(east_m: float) -> None:
     # What is near has gone out of reach of the quick fit: the one from coarse pictures finds it.
     drift = shown(check, street(2, scene=replace(SCENE, pose=pose)), 20, 10.0)
     assert drift.judged
-    assert drift.metres_at_10m == pytest.approx(0.4, abs=0.12)
+    assert drift.metres_at_10m == pytest.approx(0.6, abs=0.05)
     assert drift.moved_slightly
 
 
