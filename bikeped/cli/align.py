@@ -11,7 +11,6 @@ import msgspec
 from rich.markup import escape
 
 from bikeped.capture import open_source
-from bikeped.capture.jpeg import JpegDecoder
 from bikeped.cli.common import (
     PATH,
     FiniteRange,
@@ -30,7 +29,7 @@ from bikeped.geometry.alignment import PARAMETER_NAMES, AlignmentFit
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.types import Frame
-from bikeped.web.align import add_align
+from bikeped.web.align import add_align, frame_rgb
 from bikeped.web.align_grid import draw_grid, ground_grid
 from bikeped.web.align_points import Points, fit_json, fit_points, load_points
 from bikeped.web.align_save import Saved, file_hash, save
@@ -99,7 +98,7 @@ def command(
         if write:
             path = Path(loaded.source)
             values = {key: getattr(found.alignment, key) for key in found.standard_errors}
-            saved = save(path, values, file_hash(path))
+            saved = save(path, values, file_hash(path), picture=frame_rgb(frame))
     if grid_path is not None:
         camera = ground_camera(loaded)
         if found is not None:
@@ -146,12 +145,11 @@ def _draw(
     camera: GroundCamera, framing: Framing, frame: Frame, points: Points | None, target: Path
 ) -> None:
     grid = ground_grid(camera, framing)
-    rgb = frame.rgb if frame.rgb is not None else JpegDecoder().decode(frame.jpeg or b"")
     marks: tuple[tuple[str, float, float], ...] = ()
     if points is not None:
         share = frame.width / points.frame.width
         marks = tuple((mark.name, mark.u * share, mark.v * share) for mark in points.marks)
-    drawn = cv2.cvtColor(draw_grid(rgb, grid, marks), cv2.COLOR_RGB2BGR)
+    drawn = cv2.cvtColor(draw_grid(frame_rgb(frame), grid, marks), cv2.COLOR_RGB2BGR)
     write_whole(target, cv2.imencode(target.suffix.lower(), drawn)[1].tobytes())
 
 
@@ -180,3 +178,7 @@ def _print(found: AlignmentFit, saved: Saved | None) -> None:
     if saved is not None:
         keys = ", ".join(f"camera.{key}" for key in saved.keys)
         screen.print(f"wrote {keys} into {saved.config}; before: {saved.backup.name}")
+        if saved.reference is not None:
+            screen.print(f"wrote what the camera sees into {saved.reference}")
+        else:
+            screen.print(f"the camera's view is not saved: {saved.no_reference}")

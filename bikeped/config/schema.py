@@ -79,6 +79,9 @@ class CameraConfig(Section, frozen=True):
     """pitch, degrees; 0 is level, negative looks down"""
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
     """turns the ground frame to the right of the optical axis, degrees; 0 keeps x forward"""
+    reference: Annotated[str, Meta(min_length=1)] | None = None
+    """file of what the camera saw when it was aligned, written with an alignment, relative to this
+    file; by it the service notices that the camera has moved; null: by the first 2 s of pictures"""
     table_step_px: Annotated[int, Meta(ge=2, le=64)] = 8
     """spacing of the ground table's lattice, crop pixels"""
     stale_after_s: Annotated[float, Meta(gt=0, le=60)] = 0.5

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from bikeped.errors import GeometryError
+from bikeped.faults import Fault
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.monitor.drift_reference import (
@@ -71,9 +72,19 @@ class Drift:
     lost: bool = False  #: the reference suddenly matches nowhere, in a picture as sharp as before
     since_start: bool = False  #: no alignment saved a reference: the first pictures are it
     moved: bool = False  #: a fault: the camera must be aligned again before its positions count
-    moved_slightly: bool = (
-        False  #: a notice: it should be aligned again, but the decision still holds
-    )
+    moved_slightly: bool = False  #: a notice: align it again; the decision still holds
+
+    def fault(self) -> Fault | None:
+        """What to report. Its numbers stand in this object only: they change all the time."""
+        since = "the service started" if self.since_start else "it was aligned"
+        code, detail = "camera.moved", f"has moved since {since}; fasten it and align it again"
+        if self.moved and self.lost:
+            return Fault("camera", code, f"sees nothing of what it saw when {since}")
+        if self.moved_slightly:
+            return Fault(
+                "camera", "camera.moved_slightly", detail.replace("moved", "moved a little")
+            )
+        return Fault("camera", code, detail) if self.moved else None
 
 
 class DriftCheck:

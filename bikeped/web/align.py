@@ -19,12 +19,13 @@ import simplejpeg
 from aiohttp import hdrs, web
 from msgspec import Meta
 
+from bikeped.capture.jpeg import JpegDecoder
 from bikeped.config.build import framing, ground_camera
 from bikeped.config.load import LoadedConfig, load_config
 from bikeped.config.schema import CameraConfig
 from bikeped.errors import GeometryError
 from bikeped.geometry.alignment import PARAMETER_NAMES, Alignment
-from bikeped.types import Frame
+from bikeped.types import Frame, ImageArray
 from bikeped.web.align_grid import ground_grid
 from bikeped.web.align_points import (
     STEPS,
@@ -38,7 +39,7 @@ from bikeped.web.align_points import (
     readings,
     with_values,
 )
-from bikeped.web.align_save import ChangedError, file_hash, lines, save, why_not
+from bikeped.web.align_save import ChangedError, Saved, file_hash, lines, save, why_not
 from bikeped.web.server import Page, add_page, json_answer, json_body
 
 log = logging.getLogger(__name__)
@@ -108,7 +109,7 @@ class AlignHandlers:
         body = await json_body(request, SaveRequest)
         async with self._writing:
             try:
-                saved = await asyncio.to_thread(save, self._path, body.values, body.sha256)
+                saved = await asyncio.to_thread(self._save, body)
             except ChangedError as error:
                 return json_answer({"error": str(error)}, 409)
         log.warning(
@@ -119,7 +120,13 @@ class AlignHandlers:
             saved.backup.name,
         )
         files = {"config": str(saved.config), "backup": str(saved.backup)}
+        files["reference"] = "" if saved.reference is None else str(saved.reference)
         return json_answer({**asdict(saved), **files, "restart": self._live})
+
+    def _save(self, body: SaveRequest) -> Saved:
+        newest = self._frame()
+        picture = None if newest is None else frame_rgb(newest)
+        return save(self._path, body.values, body.sha256, picture=picture)
 
     def _state(self) -> dict[str, Any]:
         in_file = load_config(self._path)
@@ -168,6 +175,13 @@ def add_align(
     app.router.add_post("/align/grid", page.grid)
     app.router.add_post("/align/fit", page.fit)
     app.router.add_post("/align/save", page.save)
+
+
+def frame_rgb(frame: Frame | bytes) -> ImageArray:
+    """The picture [h, w, 3] of a frame, or of a JPEG file's bytes. Raises CaptureError."""
+    if isinstance(frame, Frame) and frame.rgb is not None:
+        return frame.rgb
+    return JpegDecoder().decode((frame.jpeg or b"") if isinstance(frame, Frame) else frame)
 
 
 def _jpeg(frame: Frame) -> bytes:

@@ -1,4 +1,5 @@
-"""Writing an alignment into config.yaml: only the camera's keys that changed."""
+"""Writing an alignment: into config.yaml the camera's keys that changed, and beside it what the
+camera sees, by which the service notices that it has moved."""
 
 from __future__ import annotations
 
@@ -10,14 +11,19 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import bikeped
+from bikeped.config.build import framing, ground_camera
 from bikeped.config.edit import section_lines, set_values
 from bikeped.config.load import load_config, parse_config
 from bikeped.config.provenance import provenance_path
-from bikeped.errors import ConfigError
+from bikeped.errors import ConfigError, GeometryError
 from bikeped.files import write_like
+from bikeped.monitor.drift_reference import make_reference
+from bikeped.types import ImageArray
 
 #: The only keys that a page may write: the camera's pose and its lens.
 KEYS = ("height_m", "pitch_deg", "radius_px", "cx", "cy", "heading_deg")
+#: Beside the configuration, where `camera.reference` names no other file.
+REFERENCE = "camera_reference.json"
 _DIGITS = {"height_m": 4, "pitch_deg": 3, "radius_px": 2, "cx": 2, "cy": 2, "heading_deg": 3}
 
 
@@ -27,12 +33,18 @@ class ChangedError(ConfigError):
 
 @dataclass(frozen=True)
 class Saved:
-    """What was written: the files, the keys and values now in the file, the file's new hash."""
+    """What was written: the files, the keys and values now in the file, the file's new hash.
+
+    `reference` is the file of what the camera sees; None where there is none, for the reason
+    `no_reference`.
+    """
 
     config: Path
     backup: Path
     keys: dict[str, float]
     sha256: str
+    reference: Path | None
+    no_reference: str
     promoted: bool  #: whether there is a promotion, which was measured with the camera as before
 
 
@@ -64,9 +76,14 @@ def why_not(path: Path) -> str | None:
 
 
 def save(
-    path: Path, values: Mapping[str, float], sha256: str, now: datetime | None = None
+    path: Path,
+    values: Mapping[str, float],
+    sha256: str,
+    now: datetime | None = None,
+    picture: ImageArray | None = None,
 ) -> Saved:
-    """Writes `values` (keys of `KEYS`) into the camera section of `path`.
+    """Writes `values` (keys of `KEYS`) into the camera section of `path`, and what the camera sees
+    in `picture` ([h, w, 3] RGB) into the file that `camera.reference` names then: null without one.
 
     `sha256` is the hash of the file that the values were made for: ChangedError when it is another
     one now. The file before stays beside it, with the time (UTC) in its name. ConfigError when the
@@ -83,7 +100,18 @@ def save(
     _check_same(path, text, sha256)
     new = rounded(values)
     after = set_values(text, {"camera": new}, str(path))
-    parse_config(after, str(path), path.parent)  # names a value that is out of range
+    loaded = parse_config(after, str(path), path.parent)  # names a value that is out of range
+    content, no_reference = None, "there is no picture"
+    if picture is not None:
+        try:
+            content = make_reference([picture], ground_camera(loaded), framing(loaded)).to_json()
+        except GeometryError as error:
+            no_reference = str(error)
+    old = loaded.config.camera.reference
+    name = None if content is None else old or REFERENCE
+    if name != old:
+        after = set_values(after, {"camera": {"reference": name}}, str(path))
+    reference = None if name is None else loaded.path(name)
     moment = (now or datetime.now(timezone.utc)).strftime("%Y-%m-%d-%H%M%S")
     backup = target.with_name(f"{target.name}.{moment}.bak")
     number = 1
@@ -93,6 +121,8 @@ def save(
     write_like(backup, text.encode(), target)
     try:
         _check_same(path, _read(target), sha256)
+        if content is not None and reference is not None:
+            write_like(reference, content, target)
         write_like(target, after.encode(), target)
     except BaseException:
         backup.unlink(missing_ok=True)
@@ -102,6 +132,8 @@ def save(
         backup=backup,
         keys=new,
         sha256=hashlib.sha256(after.encode()).hexdigest(),
+        reference=reference,
+        no_reference=no_reference if reference is None else "",
         promoted=provenance_path(target).exists(),
     )
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bikeped.errors import GeometryError
-from bikeped.geometry.camera import CameraPose, GroundCamera
+from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
 from bikeped.geometry.lens import Lens
 from bikeped.lab.rendering import Conditions, ScenePainter
@@ -24,6 +24,7 @@ from bikeped.lab.rendering.render_camera import (
     lens_camera,
     rectilinear_camera,
 )
+from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.monitor.camera_drift import Drift, DriftCheck, misplaced_m
 from bikeped.monitor.drift_reference import DriftReference, make_reference
 from bikeped.monitor.patch_fit import Pose, rotation
@@ -121,6 +122,12 @@ def test_a_turn_is_measured_in_other_traffic(angles: dict[str, float]) -> None:
 def test_bounds_of_notice_and_fault(angles: dict[str, float], moved: bool, slightly: bool) -> None:
     drift = checked(seen_turned(street(2), turn(**angles)))
     assert (drift.moved, drift.moved_slightly) == (moved, slightly)
+    fault = drift.fault()
+    assert (None if fault is None else fault.code) == {
+        (True, False): "camera.moved",
+        (False, True): "camera.moved_slightly",
+        (False, False): None,
+    }[moved, slightly]
 
 
 @pytest.mark.parametrize("light", ["overcast", "dusk", "night", "glare"])
@@ -237,6 +244,7 @@ def test_a_view_that_is_suddenly_another_is_lost() -> None:
     drift = shown(check, seen_turned(street(2), turn(heading_deg=120.0)), 10, 24.0)
     assert drift.lost
     assert drift.moved
+    assert str(drift.fault()) == "camera: sees nothing of what it saw when it was aligned"
 
 
 @pytest.mark.parametrize("picture", ["covered", "blurred", "noise by night"])

@@ -249,6 +249,7 @@ async function save() {
     place.replaceChildren(
       el("p", { class: "verdict ok-mark" }, `Saved into ${answer.config}.`),
       el("p", { class: "note" }, "The file before: ", el("code", {}, answer.backup.split("/").pop()), "."),
+      el("p", { class: answer.reference ? "note" : "warn" }, answer.reference ? `What the camera sees is in ${answer.reference.split("/").pop()}: the service reports when it has moved.` : `The camera’s view is not saved: ${answer.no_reference}.`),
       answer.restart ? el("p", {}, "The service reads it after a restart: ", el("code", {}, "sudo systemctl restart bikeped")) : null,
       answer.promoted ? el("p", { class: "warn" }, "The promoted decision was measured with the camera’s previous values: run ", el("code", {}, "bikeped conformance gate"), " again.") : null);
   } catch (error) {
