@@ -88,7 +88,10 @@ class Drift:
 
 
 class DriftCheck:
-    """Compares a picture now and then (once a second) with the reference. Not thread-safe."""
+    """Compares a picture now and then (once a second) with the reference. Not thread-safe.
+
+    `size` (width, height): that pictures are reduced to; larger ones take longer.
+    """
 
     def __init__(
         self, reference: DriftReference | None, camera: GroundCamera, framing: Framing
@@ -96,7 +99,7 @@ class DriftCheck:
         """`reference` None: the first 2 s of pictures are it. GeometryError when the reference was
         saved with another lens, pose or sensor."""
         self._camera, self._framing = camera, framing
-        self._size = levels_of(camera, framing)[0]
+        self.size = levels_of(camera, framing)[0]
         self._first: list[tuple[float, ImageArray]] = []
         self._fit: PatchFit | None = None
         self._last, self._next_turn = Pose.unmoved(), 0
@@ -116,7 +119,7 @@ class DriftCheck:
     def update(self, picture: ImageArray, time_s: float) -> Drift | None:
         """The drift by this picture ([h, w] grey or [h, w, 3] RGB, a scaled copy of the sensor's
         picture) at `time_s`, which only grows. None while the first pictures are collected."""
-        grey = reduced(picture, self._size)
+        grey = reduced(picture, self.size)
         if self._fit is None:
             self._begin(grey, time_s)
             return None

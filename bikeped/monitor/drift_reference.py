@@ -128,6 +128,9 @@ def reduced(picture: ImageArray, size: tuple[int, int]) -> ImageArray:
     """The picture ([h, w] grey or [h, w, 3] RGB) as a grey one of `size` (width, height)."""
     if picture.ndim == 3:
         picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+    while picture.shape[1] >= 2 * size[0] and not (picture.shape[0] % 2 or picture.shape[1] % 2):
+        half = picture.shape[1] // 2, picture.shape[0] // 2  # four times faster than at once
+        picture = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8)
     if (picture.shape[1], picture.shape[0]) != size:
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
     return picture
