@@ -148,6 +148,7 @@ class DriftCheck:
         with contextlib.suppress(GeometryError):  # too dark, or too much traffic: begin again
             reference = make_reference(pictures, self._camera, self._framing)
             self._fit, self._sharpness = PatchFit(reference), reference.sharpness
+            self._seen_s = time_s
 
     def _search(self, fit: PatchFit, grey: ImageArray, time_s: float) -> tuple[Fit, float]:
         """The best fit to this picture, and the picture's sharpness."""

@@ -247,6 +247,15 @@ def test_a_view_that_is_suddenly_another_is_lost() -> None:
     assert str(drift.fault()) == "camera: sees nothing of what it saw when it was aligned"
 
 
+def test_a_view_that_changes_right_after_the_start_is_lost() -> None:
+    check = DriftCheck(None, CAMERA, FRAMING)
+    for second in range(3):
+        check.update(street(4, t_s=0.5 * second), float(second))
+    drift = shown(check, seen_turned(street(4), turn(heading_deg=120.0)), 20, 3.0)
+    assert drift.lost
+    assert str(drift.fault()) == "camera: sees nothing of what it saw when the service started"
+
+
 @pytest.mark.parametrize("picture", ["covered", "blurred", "noise by night"])
 def test_what_cannot_be_judged_is_not_moved(picture: str) -> None:
     rng = np.random.default_rng(5)
