@@ -18,7 +18,7 @@ from typing import Literal
 #: Exit status for "start a fresh process" (EX_TEMPFAIL of sysexits.h); systemd restarts on it.
 EXIT_RESTART = 75
 
-Component = Literal["camera", "detector", "light", "speaker", "audit", "service"]
+Component = Literal["camera", "picture", "detector", "light", "speaker", "audit", "service"]
 
 
 class Effect(enum.Enum):
@@ -82,6 +82,15 @@ FAULT_KINDS: dict[str, FaultKind] = {
             "camera.moved", "camera", "The camera has moved since it was aligned; align it again."
         ),
         _ends("camera.hang", "camera", "A read has not returned for camera.hang_after_s."),
+        _stops("picture.frozen", "picture", "The same pictures come again and again."),
+        _stops("picture.black", "picture", "The picture is black."),
+        _stops("picture.white", "picture", "The picture is white."),
+        _stops("picture.one_colour", "picture", "The picture has one colour."),
+        _stops("picture.covered", "picture", "Much of what the picture showed is hidden or gone."),
+        _withholds("picture.blurred", "picture", "The whole picture is blurred."),
+        _withholds("picture.spray", "picture", "Parts of the picture are blurred: drops or dirt."),
+        _minor("picture.underexposed", "picture", "The picture is very dark."),
+        _minor("picture.overexposed", "picture", "Much of the picture is overexposed."),
         _stops("detector.no_answer", "detector", "No answer for detection.silent_after_s."),
         _stops("detector.future_time", "detector", "The newest answer's time is in the future."),
         _stops("detector.error", "detector", "The detector fails on every frame."),

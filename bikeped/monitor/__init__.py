@@ -1,1 +1,1 @@
-"""May what was seen be trusted? Health of the picture, drift of the camera."""
+"""May what was seen be trusted? The picture, the camera's place, the detector."""

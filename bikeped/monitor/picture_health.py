@@ -1,0 +1,134 @@
+"""Whether the picture can be trusted: frozen, of one colour, covered, blurred, sprayed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bikeped.monitor.known_scene import KnownScene
+from bikeped.monitor.reduced_picture import Circle, Reduced, inside, reduce, tile_grid, tiles, usable
+from bikeped.monitor.repeated_pictures import RepeatedPictures
+from bikeped.monitor.sharpness import Sharpness
+from bikeped.monitor.verdicts import Hold, Verdict
+from bikeped.types import ImageArray
+
+_EVERY_S = 0.2  #: all but repeated pictures is judged this often
+_JUMP_S = 5.0  #: a longer gap begins the holds anew
+_FROZEN_S = 1.2
+_FLAT = (3.0, 8.0)  #: grey levels between the tiles of a dark, and of another, picture of one colour
+_DARK, _BRIGHT = 20.0, 235.0
+_LOST = 0.5  #: share of the known structures
+_BLURRED = 1.2  #: sharpness (`Sharpness`) that is too little at any site
+_BLURRED_SHARE = 0.35  #: of the site's own above 1
+_SPRAYED = 0.25  #: share of the parts
+_UNDEREXPOSED = 25.0  #: grey levels of the brightest tenth
+_CLIPPED, _OVEREXPOSED = 250.0, 0.35  #: grey levels, and the share of the picture above them
+_CODES = ("black", "white", "one_colour", "covered", "blurred", "spray", "underexposed", "overexposed")
+
+
+class PictureHealth:
+    """Judges the pictures of one camera, one after the other.
+
+    `circle`: centre u, v and radius of the image circle as shares of the picture's width, height
+    and width; None for a lens that fills the picture.
+    """
+
+    def __init__(self, circle: Circle | None = None) -> None:
+        self._circle = circle
+        self._restart(())
+
+    def _restart(self, shape: tuple[int, ...]) -> None:
+        """Begins anew, for pictures of this shape: nothing is known of their scene."""
+        self._shape = shape
+        self._time_s = self._judged_s = math.nan
+        self._repeated = RepeatedPictures()
+        self._sharpness = Sharpness(self._circle, shape[1] / shape[0] if shape else 1.0)
+        self._scene: KnownScene | None = None
+        holds = (
+            Hold("picture.frozen", 0.0, "The picture does not change."),
+            Hold("picture.black", 0.5, "The picture is black."),
+            Hold("picture.white", 0.5, "The picture is white."),
+            Hold("picture.one_colour", 0.5, "The picture has one colour."),
+            Hold("picture.covered", 2.0, "What the picture showed is hidden, or the camera turned."),
+            Hold("picture.blurred", 3.0, "The picture is blurred."),
+            Hold("picture.spray", 4.0, "Parts of the picture are blurred: drops or dirt."),
+            Hold("picture.underexposed", 5.0, "The picture is very dark."),
+            Hold("picture.overexposed", 5.0, "Much of the picture is overexposed."),
+        )
+        self._holds = holds
+        self._verdicts = tuple(hold.update(math.nan, math.inf, 0.0) for hold in holds)
+
+    def update(self, rgb: ImageArray, time_s: float) -> tuple[Verdict, ...]:
+        """The verdicts, always in the same order, with the picture [h, w, 3] uint8 at `time_s`.
+
+        `time_s` is media time. One that is not finite or repeats, or a picture smaller than 16
+        pixels, changes nothing; one that runs backwards, or a picture of another shape, begins
+        anew.
+        """
+        if not math.isfinite(time_s) or not usable(rgb) or time_s == self._time_s:
+            return self._verdicts
+        if rgb.shape != self._shape or time_s < self._time_s:
+            self._restart(rgb.shape)
+        elif time_s - self._time_s > _JUMP_S:
+            for hold in self._holds:
+                hold.restart()
+            self._repeated = RepeatedPictures()
+            self._judged_s = math.nan
+        self._time_s = time_s
+        still_s = self._repeated.update(rgb, time_s)
+        frozen = self._holds[0].update(still_s, _FROZEN_S, time_s)
+        rest = self._verdicts[1:]
+        if not time_s - self._judged_s < _EVERY_S * 0.99:
+            passed_s = _EVERY_S if math.isnan(self._judged_s) else time_s - self._judged_s
+            self._judged_s = time_s
+            rest = self._judge(reduce(rgb), passed_s, still_s)
+        self._verdicts = (frozen, *rest)
+        return self._verdicts
+
+    def _judge(self, picture: Reduced, passed_s: float, still_s: float) -> tuple[Verdict, ...]:
+        """All verdicts but `picture.frozen`."""
+        height, width = self._shape[:2]
+        grid = tile_grid(height, width)
+        region = inside(*grid, self._circle, width / height)
+        if self._scene is None:
+            self._scene = KnownScene(picture.coarse, region)
+        levels = tiles(picture.coarse.astype(np.float32))[region]
+        means = levels.mean(axis=-1)
+        lit = means > _DARK
+        if self._circle is None and lit.mean() > 0.1:
+            means = means[lit]  # not the black around an image circle or a letter box
+        low, middle, high = np.quantile(means, (0.01, 0.5, 0.99)).tolist()
+        spread = high - low
+        flat = _FLAT[0] if middle < _DARK else _FLAT[1]
+        # As a share, so that larger is worse: 1 is as even as a picture of one colour.
+        even = flat / max(spread, 0.01)
+        before = {v.code: v for v in self._verdicts}
+        wrong = any(
+            v.beyond or v.active for c, v in before.items() if not c.endswith("exposed")
+        ) or even >= 1.0 or still_s > _FROZEN_S / 2
+        covered = before["picture.covered"]
+        lost = self._scene.update(
+            picture.coarse, passed_s, covered.active or covered.beyond, not wrong
+        )
+        usual = self._sharpness.usual
+        sharp, sprayed = self._sharpness.update(picture.lines, passed_s, not wrong)
+        blurred = _BLURRED if math.isnan(usual) else max(
+            _BLURRED, 1.0 + _BLURRED_SHARE * (usual - 1.0)
+        )
+        # A flat picture has no sharpness of its own to be judged by.
+        flatness = math.nan if even >= 1.0 else 1.0
+        values = {
+            "black": (even if middle < _DARK else 0.0, 1.0),
+            "white": (even if middle > _BRIGHT else 0.0, 1.0),
+            "one_colour": (even if _DARK <= middle <= _BRIGHT else 0.0, 1.0),
+            "covered": (lost, _LOST),
+            "blurred": (blurred / max(sharp, 0.01) * flatness, 1.0),
+            "spray": (sprayed * flatness, _SPRAYED),
+            "underexposed": (_UNDEREXPOSED / max(float(np.quantile(means, 0.9)), 0.1), 1.0),
+            "overexposed": (float((levels > _CLIPPED).mean()), _OVEREXPOSED),
+        }
+        return tuple(
+            hold.update(*values[code], self._time_s)
+            for code, hold in zip(_CODES, self._holds[1:], strict=True)
+        )
