@@ -15,12 +15,17 @@ from bikeped.types import BoolArray, Float32Array, ImageArray
 
 _STRUCTURE = 1.2  #: grey levels of deviation within a tile, from which it can be recognised
 _RECOGNISED = 0.4  #: correlation with a remembered look
+_VANISHED = 0.15  #: of the remembered deviation, below which a likeness is that of a fading echo
 _BLANK = 0.4  #: of the remembered deviation: what is there now has no structure
 _KNOWN_S = 2.0  #: a look counts when it has been seen for so long
 _FORGET_S = 15.0  #: time constant with which a recognised look follows the scene
 _NEW_LOOK_S = 60.0  #: something else with structure is a second look after this time,
 _NEW_LOOK_COVERED_S = 600.0  #: and after this one while the picture counts as covered
 _SMOOTH_S = 0.4  #: time constant of the picture that is compared: takes off noise
+#: A tile without structure has changed when its brightness, in proportion to that of the tiles
+#: that are recognised, is off by so many grey levels and by this share.
+_CHANGED, _CHANGED_SHARE = 25.0, 0.3
+_AREA = 0.8  #: of the whole picture hidden counts as all structures lost
 _FEW = 8  #: tiles with structure, below which nothing can be said
 
 
@@ -36,6 +41,7 @@ class KnownScene:
         self._deviations = np.stack([deviation, np.zeros_like(deviation)])
         self._seen_s = np.zeros(self._deviations.shape, np.float32)
         self._lost_s = np.zeros(deviation.shape, np.float32)
+        self._means = tiles(self._smooth).mean(axis=-1)
 
     def _look(self) -> tuple[Float32Array, Float32Array]:
         """Structures of a few pixels [m, n, 64] around zero, and their deviation [m, n]."""
@@ -47,6 +53,7 @@ class KnownScene:
     def update(self, coarse: ImageArray, passed_s: float, covered: bool, learn: bool) -> float:
         """Share of the known structures that are lost; those hidden by something blank count twice.
 
+        As much counts a blank part of the picture in other brightness, where no structure was.
         `passed_s` since the last picture; `covered`: the picture counts as covered already;
         `learn`: nothing is wrong with it. NaN where too little is known.
         """
@@ -55,6 +62,7 @@ class KnownScene:
         look, deviation = self._look()
         scale = np.maximum(self._deviations * deviation, 1e-6)
         likeness = (self._looks * look).mean(axis=-1) / scale
+        likeness[deviation < _VANISHED * self._deviations] = 0.0
         likeness[(self._deviations < _STRUCTURE) & (deviation < _STRUCTURE)] = 1.0
         best = np.where(self._seen_s[1] > 0, likeness.argmax(axis=0), 0)
         found = np.take_along_axis(likeness, best[None], axis=0)[0] >= _RECOGNISED
@@ -62,18 +70,29 @@ class KnownScene:
         judged = known & (self._deviations[0] >= _STRUCTURE) & self._region
         lost = judged & ~found
         blank = lost & (deviation < _BLANK * self._deviations[0])
-        self._lost_s = np.where(found, 0.0, self._lost_s + passed_s).astype(np.float32)
+        means = tiles(self._smooth).mean(axis=-1)
+        seen = judged & found
+        gain = np.median(means[seen] / np.maximum(self._means[seen], 1.0)) if seen.any() else 1.0
+        usual = np.maximum(gain * self._means, 1.0)
+        off = np.abs(means - usual) > np.maximum(_CHANGED, _CHANGED_SHARE * usual)
+        flat = known & ~judged & self._region & (deviation < _STRUCTURE)
+        hidden = (blank | (flat & off)).sum() / self._region.sum()
+        self._lost_s = np.where(found & ~off, 0.0, self._lost_s + passed_s).astype(np.float32)
         patience_s = _NEW_LOOK_COVERED_S if covered else _NEW_LOOK_S
         self._adopt(look, deviation, 0, ~known & ~found)
         if learn or covered:
             strange = known & ~found & (deviation >= _STRUCTURE) & (self._lost_s > patience_s)
             self._adopt(look, deviation, 1, strange)
+        if learn or covered:
+            keep = off & known & (self._lost_s < patience_s)
+            weights = np.where(keep, 0.0, min(1.0, passed_s / _FORGET_S)).astype(np.float32)
+            self._means += weights * (means - self._means)
         if learn:
             for slot in (0, 1):
                 self._follow(look, slot, found & (best == slot), passed_s)
         if judged.sum() < _FEW:
             return float("nan")
-        return float((lost.sum() + blank.sum()) / judged.sum())
+        return float(max((lost.sum() + blank.sum()) / judged.sum(), hidden / _AREA))
 
     def _adopt(
         self, look: Float32Array, deviation: Float32Array, slot: int, where: BoolArray

@@ -21,7 +21,7 @@ _DARK, _BRIGHT = 20.0, 235.0
 _LOST = 0.5  #: share of the known structures
 _BLURRED = 1.2  #: sharpness (`Sharpness`) that is too little at any site
 _BLURRED_SHARE = 0.35  #: of the site's own above 1
-_SPRAYED = 0.25  #: share of the parts
+_SPRAYED = 0.15  #: share of the parts
 _UNDEREXPOSED = 25.0  #: grey levels of the brightest tenth
 _CLIPPED, _OVEREXPOSED = 250.0, 0.35  #: grey levels, and the share of the picture above them
 _CODES = ("black", "white", "one_colour", "covered", "blurred", "spray", "underexposed", "overexposed")
@@ -51,7 +51,7 @@ class PictureHealth:
             Hold("picture.white", 0.5, "The picture is white."),
             Hold("picture.one_colour", 0.5, "The picture has one colour."),
             Hold("picture.covered", 2.0, "What the picture showed is hidden, or the camera turned."),
-            Hold("picture.blurred", 3.0, "The picture is blurred."),
+            Hold("picture.blurred", 2.5, "The picture is blurred."),
             Hold("picture.spray", 4.0, "Parts of the picture are blurred: drops or dirt."),
             Hold("picture.underexposed", 5.0, "The picture is very dark."),
             Hold("picture.overexposed", 5.0, "Much of the picture is overexposed."),
@@ -62,7 +62,7 @@ class PictureHealth:
     def update(self, rgb: ImageArray, time_s: float) -> tuple[Verdict, ...]:
         """The verdicts, always in the same order, with the picture [h, w, 3] uint8 at `time_s`.
 
-        `time_s` is media time. One that is not finite or repeats, or a picture smaller than 16
+        `time_s` is media time. One that is not finite or repeats, or a picture smaller than 48
         pixels, changes nothing; one that runs backwards, or a picture of another shape, begins
         anew.
         """

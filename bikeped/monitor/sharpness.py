@@ -10,16 +10,19 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from bikeped.monitor.reduced_picture import inside
-from bikeped.monitor.reduced_picture import Circle
+from bikeped.monitor.reduced_picture import Circle, inside
 from bikeped.types import BoolArray, Float32Array, ImageArray
 
-GRID = (15, 20)  #: rows and columns of parts
+GRID = (20, 32)  #: rows and columns of parts
 _SIGMAS = (1.0, 2.0)  #: pixels of `Reduced.lines`
-_SMOOTH_S = 0.6
+_ROWS = 80  #: lines that are enough
+_SMOOTH_S = 0.3  #: time constant of the whole picture's sharpness,
+_PARTS_SMOOTH_S = 2.0  #: and of the parts', which is noisier
 _WEAK = 0.05  #: squared grey levels a pixel: without slopes nothing can be said
 _SHARP = 1.3  #: a part that has been sharper than this can be seen to lose it
-_PART_LOST = 0.45  #: of a part's usual sharpness, in proportion to the whole picture's
+#: A part is blurred below these shares, of its usual sharpness and of its usual energy of fine
+#: slopes; both in proportion to the whole picture's: light and weather change them everywhere.
+_PART_SHARP, _PART_LEFT = 0.75, 0.5
 _FEW = 8
 _KNOWN_S = 2.0
 _FORGET_S = 60.0
@@ -34,12 +37,12 @@ class Sharpness:
         self._region: BoolArray = inside(*GRID, circle, aspect)
         self._before: list[Float32Array] = []
         self._energy = np.zeros((2, *GRID), np.float32)
+        self._parts = np.zeros((2, *GRID), np.float32)
         self._noise = np.zeros(2, np.float32)
         self._pictures = 0
         self._seen_s = 0.0
-        self._part_seen_s = np.zeros(GRID, np.float32)
         self._usual = 1.0
-        self._usual_part = np.ones(GRID, np.float32)
+        self._usual_energy = np.zeros((2, *GRID), np.float32)
 
     @property
     def usual(self) -> float:
@@ -52,33 +55,48 @@ class Sharpness:
         `learn`: nothing is wrong with the picture.
         """
         self._measure(lines, passed_s)
-        noise = self._noise[:, None, None]
-        fine, wide = np.maximum(self._energy - noise, 0.0)
-        wide_in = wide[self._region]
-        strong = self._region & (wide >= max(float(np.median(wide_in)), float(self._noise[1]), _WEAK))
+        fine, wide = energy = np.maximum(self._energy - self._noise[:, None, None], 0.0)
+        strong = self._strong(wide)
         if strong.sum() < 2 or self._pictures < 2:
             return float("nan"), float("nan")
         sharp = float(fine[strong].sum() / wide[strong].sum())
-        part = fine / np.maximum(wide, 1e-6)
-        judged = strong & (self._usual_part >= _SHARP) & (self._part_seen_s >= _KNOWN_S)
-        whole = min(1.0, max(sharp - 1.0, 0.0) / max(self._usual - 1.0, 1e-3))
-        lost = judged & (part - 1.0 < _PART_LOST * whole * (self._usual_part - 1.0))
+        share, lost = self._lost(np.maximum(self._parts - self._noise[:, None, None], 0.0), sharp)
         if learn:
             self._seen_s += passed_s
-            self._usual += passed_s / min(self._seen_s, _FORGET_S) * (sharp - self._usual)
-            self._part_seen_s += np.where(strong & ~lost, np.float32(passed_s), np.float32(0))
-            weight = passed_s / np.clip(self._part_seen_s, passed_s, _FORGET_S)
-            weight = np.where(strong & ~lost, weight, 0).astype(np.float32)
-            self._usual_part += weight * (part - self._usual_part)
-        share = float(lost.sum() / judged.sum()) if judged.sum() >= _FEW else float("nan")
+            weight = min(1.0, passed_s / min(self._seen_s, _FORGET_S))
+            self._usual += weight * (sharp - self._usual)
+            self._usual_energy += weight * np.where(lost, 0, energy - self._usual_energy)
         return sharp, share
+
+    def _strong(self, wide: Float32Array) -> BoolArray:
+        """Parts with edges: the better half of those inside the circle."""
+        least = max(float(np.median(wide[self._region])), float(self._noise[1]), _WEAK)
+        return np.asarray(self._region & (wide >= least))
+
+    def _lost(self, energy: Float32Array, sharp: float) -> tuple[float, BoolArray]:
+        """Share of the parts with edges that are blurred more than the picture, and where."""
+        usual_fine, usual_wide = self._usual_energy
+        usual_part = usual_fine / np.maximum(usual_wide, 1e-6)
+        judged = self._strong(usual_wide) & (usual_part >= _SHARP)
+        if self._seen_s < _KNOWN_S or judged.sum() < _FEW:
+            return float("nan"), np.zeros(GRID, np.bool_)
+        whole = min(1.0, max(sharp - 1.0, 0.0) / max(self._usual - 1.0, 1e-3))
+        blurred = energy[0] / np.maximum(energy[1], 1e-6) - 1.0 < _PART_SHARP * whole * (
+            usual_part - 1.0
+        )
+        left = energy[0] / np.maximum(usual_fine, 1e-6)
+        lost = judged & blurred & (left < _PART_LEFT * min(1.0, float(np.median(left[judged]))))
+        return float(lost.sum() / judged.sum()), lost
 
     def _measure(self, lines: ImageArray, passed_s: float) -> None:
         """Updates the energies of slopes and of noise."""
-        slopes = [_slopes(lines, kernel) for kernel in _KERNELS]
+        few = np.asarray(lines[:: max(1, lines.shape[0] // _ROWS)])
+        slopes = [_slopes(few, kernel) for kernel in _KERNELS]
         energy = np.stack([_energy(slope) for slope in slopes])
         weight = np.float32(1.0 - np.exp(-passed_s / _SMOOTH_S)) if self._pictures else np.float32(1)
         self._energy += weight * (energy - self._energy)
+        slow = np.float32(1.0 - np.exp(-passed_s / _PARTS_SMOOTH_S)) if self._pictures else weight
+        self._parts += slow * (energy - self._parts)
         if self._before:
             change = [_energy(now - old) for now, old in zip(slopes, self._before, strict=True)]
             noise = np.array([0.5 * np.median(part[self._region]) for part in change], np.float32)
@@ -93,8 +111,9 @@ def _slopes(lines: ImageArray, kernel: Float32Array) -> Float32Array:
 
 
 def _energy(slopes: Float32Array) -> Float32Array:
-    """Variance of the slopes in every part [15, 20]: an even shading has none."""
-    size = GRID[::-1]
-    mean = cv2.resize(slopes, size, interpolation=cv2.INTER_AREA)
-    square = cv2.resize(np.square(slopes), size, interpolation=cv2.INTER_AREA)
+    """Variance of the slopes in every part [20, 32]: an even shading has none."""
+    tall, wide = slopes.shape[0] // GRID[0], slopes.shape[1] // GRID[1]
+    cut = np.ascontiguousarray(slopes[: tall * GRID[0], : wide * GRID[1]])
+    mean = cv2.resize(cut, GRID[::-1], interpolation=cv2.INTER_AREA)
+    square = cv2.resize(cv2.multiply(cut, cut), GRID[::-1], interpolation=cv2.INTER_AREA)
     return np.asarray(square - np.square(mean), np.float32)
