@@ -89,6 +89,8 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _stops("picture.covered", "picture", "Much of what the picture showed is hidden or gone."),
         _withholds("picture.blurred", "picture", "The whole picture is blurred."),
         _withholds("picture.spray", "picture", "Parts of the picture are blurred: drops or dirt."),
+        _withholds("picture.check_failed", "picture", "The checks of the picture have failed."),
+        _minor("picture.unchecked", "picture", "The picture is not checked: monitor.picture."),
         _minor("picture.underexposed", "picture", "The picture is very dark."),
         _minor("picture.overexposed", "picture", "Much of the picture is overexposed."),
         _stops("detector.no_answer", "detector", "No answer for detection.silent_after_s."),

@@ -247,6 +247,7 @@ camera:
   fov_deg: 73
   height_m: 5.0
   pitch_deg: -35
+monitor: {{picture: false}}
 detection: {{model: {model}, providers: [cpu], threads: 1, rider_overlap: 1.0}}
 mqtt:
   health_interval_s: 0.2

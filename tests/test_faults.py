@@ -14,7 +14,7 @@ SOURCE = Path(__file__).parents[1] / "bikeped"
 @pytest.mark.parametrize("kind", FAULT_KINDS.values(), ids=FAULT_KINDS)
 def test_every_row_is_consistent(kind):
     assert kind.code.startswith(
-        ("camera.", "detector.", "light.", "speaker.", "audit.", "service.")
+        ("camera.", "picture.", "detector.", "light.", "speaker.", "audit.", "service.")
     )
     assert kind.code.partition(".")[0] == kind.component
     assert kind.meaning.endswith(".")

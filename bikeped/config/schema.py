@@ -223,6 +223,13 @@ class LatencyConfig(Section, frozen=True):
     """part of the camera's delay that its time stamp does not show, seconds"""
 
 
+class MonitorConfig(Section, frozen=True):
+    """Checks of what was seen: the picture's health, and whether the camera has moved."""
+
+    picture: bool = True
+    """judge every picture; off is for tests and drawn recordings, and health then says so"""
+
+
 class Config(Section, frozen=True):
     """The whole configuration."""
 
@@ -230,6 +237,7 @@ class Config(Section, frozen=True):
     detection: DetectionConfig = msgspec.field(default_factory=DetectionConfig)
     tracking: TrackingConfig = msgspec.field(default_factory=TrackingConfig)
     decision: DecisionConfig = msgspec.field(default_factory=DecisionConfig)
+    monitor: MonitorConfig = msgspec.field(default_factory=MonitorConfig)
     feedback: FeedbackConfig = msgspec.field(default_factory=FeedbackConfig)
     mqtt: MqttConfig = msgspec.field(default_factory=MqttConfig)
     web: WebConfig = msgspec.field(default_factory=WebConfig)

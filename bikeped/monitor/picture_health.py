@@ -7,7 +7,15 @@ import math
 import numpy as np
 
 from bikeped.monitor.known_scene import KnownScene
-from bikeped.monitor.reduced_picture import Circle, Reduced, inside, reduce, tile_grid, tiles, usable
+from bikeped.monitor.reduced_picture import (
+    Circle,
+    Reduced,
+    inside,
+    reduce,
+    tile_grid,
+    tiles,
+    usable,
+)
 from bikeped.monitor.repeated_pictures import RepeatedPictures
 from bikeped.monitor.sharpness import Sharpness
 from bikeped.monitor.verdicts import Hold, Verdict
@@ -16,7 +24,10 @@ from bikeped.types import ImageArray
 _EVERY_S = 0.2  #: all but repeated pictures is judged this often
 _JUMP_S = 5.0  #: a longer gap begins the holds anew
 _FROZEN_S = 1.2
-_FLAT = (3.0, 8.0)  #: grey levels between the tiles of a dark, and of another, picture of one colour
+_FLAT = (
+    3.0,
+    8.0,
+)  #: grey levels between the tiles of a dark, and of another, picture of one colour
 _DARK, _BRIGHT = 20.0, 235.0
 _LOST = 0.5  #: share of the known structures
 _BLURRED = 1.2  #: sharpness (`Sharpness`) that is too little at any site
@@ -24,7 +35,16 @@ _BLURRED_SHARE = 0.35  #: of the site's own above 1
 _SPRAYED = 0.15  #: share of the parts
 _UNDEREXPOSED = 25.0  #: grey levels of the brightest tenth
 _CLIPPED, _OVEREXPOSED = 250.0, 0.35  #: grey levels, and the share of the picture above them
-_CODES = ("black", "white", "one_colour", "covered", "blurred", "spray", "underexposed", "overexposed")
+_CODES = (
+    "black",
+    "white",
+    "one_colour",
+    "covered",
+    "blurred",
+    "spray",
+    "underexposed",
+    "overexposed",
+)
 
 
 class PictureHealth:
@@ -50,7 +70,9 @@ class PictureHealth:
             Hold("picture.black", 0.5, "The picture is black."),
             Hold("picture.white", 0.5, "The picture is white."),
             Hold("picture.one_colour", 0.5, "The picture has one colour."),
-            Hold("picture.covered", 2.0, "What the picture showed is hidden, or the camera turned."),
+            Hold(
+                "picture.covered", 2.0, "What the picture showed is hidden, or the camera turned."
+            ),
             Hold("picture.blurred", 2.5, "The picture is blurred."),
             Hold("picture.spray", 4.0, "Parts of the picture are blurred: drops or dirt."),
             Hold("picture.underexposed", 5.0, "The picture is very dark."),
@@ -104,17 +126,19 @@ class PictureHealth:
         # As a share, so that larger is worse: 1 is as even as a picture of one colour.
         even = flat / max(spread, 0.01)
         before = {v.code: v for v in self._verdicts}
-        wrong = any(
-            v.beyond or v.active for c, v in before.items() if not c.endswith("exposed")
-        ) or even >= 1.0 or still_s > _FROZEN_S / 2
+        wrong = (
+            any(v.beyond or v.active for c, v in before.items() if not c.endswith("exposed"))
+            or even >= 1.0
+            or still_s > _FROZEN_S / 2
+        )
         covered = before["picture.covered"]
         lost = self._scene.update(
             picture.coarse, passed_s, covered.active or covered.beyond, not wrong
         )
         usual = self._sharpness.usual
         sharp, sprayed = self._sharpness.update(picture.lines, passed_s, not wrong)
-        blurred = _BLURRED if math.isnan(usual) else max(
-            _BLURRED, 1.0 + _BLURRED_SHARE * (usual - 1.0)
+        blurred = (
+            _BLURRED if math.isnan(usual) else max(_BLURRED, 1.0 + _BLURRED_SHARE * (usual - 1.0))
         )
         # A flat picture has no sharpness of its own to be judged by.
         flatness = math.nan if even >= 1.0 else 1.0

@@ -93,7 +93,9 @@ class Sharpness:
         few = np.asarray(lines[:: max(1, lines.shape[0] // _ROWS)])
         slopes = [_slopes(few, kernel) for kernel in _KERNELS]
         energy = np.stack([_energy(slope) for slope in slopes])
-        weight = np.float32(1.0 - np.exp(-passed_s / _SMOOTH_S)) if self._pictures else np.float32(1)
+        weight = (
+            np.float32(1.0 - np.exp(-passed_s / _SMOOTH_S)) if self._pictures else np.float32(1)
+        )
         self._energy += weight * (energy - self._energy)
         slow = np.float32(1.0 - np.exp(-passed_s / _PARTS_SMOOTH_S)) if self._pictures else weight
         self._parts += slow * (energy - self._parts)

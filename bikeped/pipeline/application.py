@@ -31,6 +31,7 @@ from bikeped.pipeline.detection_scheduler import (
 from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, Limits
 from bikeped.pipeline.feed import Feed
 from bikeped.pipeline.loop import FrameResultListener, Loop
+from bikeped.pipeline.picture_monitor import UNCHECKED, picture_monitor
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher, SignalListener
 from bikeped.pipeline.telemetry import Telemetry, report_health
 from bikeped.pipeline.track_and_decide import TrackAndDecide
@@ -146,7 +147,7 @@ class Application:
         self.dispatcher = SignalDispatcher(logic, light, speaker, (self.telemetry, *watchers))
         self.loop = Loop(
             feed=feed,
-            detection=DetectionStage(detector, view_width),
+            detection=DetectionStage(detector, view_width, picture_monitor(loaded)),
             track_and_decide=track_and_decide,
             dispatcher=self.dispatcher,
             outputs=(self.telemetry, *watchers, *outputs),
@@ -156,6 +157,7 @@ class Application:
                 lambda: None if speaker is None else speaker.fault,
                 lambda: None if audit is None else audit.fault,
                 lambda: light.fault,
+                lambda: None if loaded.config.monitor.picture else UNCHECKED,
             ),
         )
         self._web_context = WebContext(

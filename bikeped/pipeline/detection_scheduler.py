@@ -19,6 +19,7 @@ from bikeped.detection.detector import DetectionResult, Detector
 from bikeped.errors import BikepedError, CaptureError, GeometryError
 from bikeped.pipeline.fault_monitor import FaultMonitor
 from bikeped.pipeline.feed import Feed
+from bikeped.pipeline.picture_monitor import NO_CHECKS, PictureChecks, PictureMonitor
 from bikeped.pipeline.runtime import RateLimitedLogger, WorkerThread
 from bikeped.pipeline.track_and_decide import GroundMapper
 from bikeped.types import Frame, ImageArray
@@ -42,6 +43,7 @@ class DecodedFrame:
     received_s: float  #: time.perf_counter() when the frame was taken over
     acquire_ms: float
     decode_ms: float
+    checks: PictureChecks = NO_CHECKS
 
 
 class FrameDetector(Protocol):
@@ -81,17 +83,22 @@ class DetectorPool:
 
 
 class DetectionStage:
-    """Decodes at the smallest scale that the detector needs, and detects.
+    """Decodes at the smallest scale that the detector needs, checks the picture, and detects.
 
     `view_width`: pixels that a picture for people needs. `decode` belongs to one thread, `detect`
     to one or more others.
     """
 
-    def __init__(self, detector: FrameDetector, view_width: int = 0) -> None:
+    def __init__(
+        self,
+        detector: FrameDetector,
+        view_width: int = 0,
+        picture_monitor: PictureMonitor | None = None,
+    ) -> None:
         self.detect = detector.detect
         self.max_inflight = detector.max_inflight if isinstance(detector, DetectorPool) else 1
         self._decode_size = detector.decode_size
-        self._view_width = view_width
+        self._view_width, self._picture_monitor = view_width, picture_monitor
         self._jpeg = JpegDecoder(buffers=FRAME_BUFFERS)
 
     def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> DecodedFrame:
@@ -106,7 +113,10 @@ class DetectionStage:
                 width, height = view, max(height, round(frame.height * view / frame.width))
             rgb = self._jpeg.decode(frame.jpeg, min_width=width, min_height=height)
         decode_ms = (time.perf_counter() - began) * 1e3
-        return DecodedFrame(frame, rgb, received_s, acquire_ms, decode_ms)
+        checks = NO_CHECKS
+        if self._picture_monitor is not None:
+            checks = self._picture_monitor.update(rgb, frame.captured_s)
+        return DecodedFrame(frame, rgb, received_s, acquire_ms, decode_ms, checks)
 
 
 @dataclass

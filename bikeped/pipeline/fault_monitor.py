@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from bikeped.faults import Effect, Fault
 from bikeped.pipeline.feed import Feed
+from bikeped.pipeline.picture_monitor import NO_CHECKS, PictureChecks
 from bikeped.pipeline.runtime import WorkerThread
 
 #: Frames that do not decode for this long: the camera is opened anew.
@@ -49,7 +50,7 @@ class _Failure:
 
 
 class FaultMonitor:
-    """Collects the faults of a live pipeline; a recording has none.
+    """Collects the faults of a pipeline; a recording has those of its pictures only.
 
     `sources` are asked for faults of other parts: a fault made there reaches light and health as
     the table in `bikeped.faults` says.
@@ -62,6 +63,7 @@ class FaultMonitor:
         self._sources = tuple(sources)
         self._failures: dict[str, _Failure] = {}  # by code
         self._answered_s = -math.inf  # capture time of the newest processed frame
+        self.picture = NO_CHECKS  #: of the newest processed frame
 
     def record(self, code: str, source: str, detail: str | None, now_s: float) -> None:
         """What a stage did with a frame: it failed as `detail` says, or did well (None)."""
@@ -70,14 +72,15 @@ class FaultMonitor:
         elif code not in self._failures:
             self._failures[code] = _Failure(Fault(source, code, detail), now_s)
 
-    def processed(self, captured_s: float) -> None:
-        """The frame captured at `captured_s` led to a decision."""
-        self._answered_s = captured_s
+    def processed(self, captured_s: float, checks: PictureChecks = NO_CHECKS) -> None:
+        """The frame captured at `captured_s` led to a decision; `checks`: of its picture."""
+        self._answered_s, self.picture = captured_s, checks
 
     def faults(self, now_s: float) -> tuple[Fault, ...]:
-        """The faults with which the light must show FAULT; empty when the decision holds."""
+        """The faults that the light shows; empty when the decision holds."""
+        checks = [f for f in self.picture.faults() if f.kind.effect is not Effect.NOTICE]
         if not self._feed.live:
-            return ()
+            return tuple(checks)
         error, limits = self._feed.error, self._limits
         faults: list[Fault | None] = [
             _age_fault("camera", "frame", self._feed.age_s(now_s), limits.stale_after_s),
@@ -85,14 +88,18 @@ class FaultMonitor:
             *self._failed("camera.frame_size"),
             None if error is None else Fault("camera", "camera.error", str(error)),
             *self._from_sources(Effect.FAULT),
+            *(fault for fault in checks if fault.kind.effect is Effect.FAULT),
         ]
         if any(faults):  # the cause, where a stage fails; one bad frame among good ones is no fault
             faults += self._failed("camera.undecodable", "detector.error")
+        faults += self._from_sources(Effect.WITHHELD)
+        faults += (fault for fault in checks if fault.kind.effect is Effect.WITHHELD)
         return tuple(fault for fault in faults if fault is not None)
 
     def notices(self) -> tuple[Fault, ...]:
-        """The faults of other parts that leave the light as decided."""
-        return tuple(self._from_sources(Effect.NOTICE))
+        """The faults that leave the light as decided."""
+        checks = (f for f in self.picture.faults() if f.kind.effect is Effect.NOTICE)
+        return (*checks, *self._from_sources(Effect.NOTICE))
 
     def _failed(self, *codes: str) -> list[Fault]:
         return [self._failures[code].fault for code in codes if code in self._failures]

@@ -211,7 +211,7 @@ class Loop:
         tracking = self._track_and_decide.update(
             answer.detections, frame.width, frame.height, frame.captured_s, age_s
         )
-        self.monitor.processed(frame.captured_s)
+        self.monitor.processed(frame.captured_s, decoded.checks)
         self.counts.frames += 1
         began = time.perf_counter()
         signal = self._dispatcher.dispatch(now_s, tracking.decision, self.monitor.faults(now_s))

@@ -18,7 +18,15 @@ from bikeped.feedback.light import LightDriver
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.builders import encode, event_line, json_number, rfc3339, tracks_message
+from bikeped.telemetry.builders import (
+    check_status,
+    drift_status,
+    encode,
+    event_line,
+    json_number,
+    rfc3339,
+    tracks_message,
+)
 from bikeped.telemetry.event_files import AuditLog
 from bikeped.telemetry.latency import StageTimes
 from bikeped.telemetry.metrics import Metrics
@@ -123,13 +131,12 @@ class Telemetry:
 
     def health(self, loop: Loop, light: str) -> HealthMessage:
         """The health message now; `light` names the kind of light, as `feedback.light` does."""
-        signal = self._signal
-        faults = (*(signal.faults if signal else ()), *loop.monitor.notices())
+        signal, faults = self._signal, self._faults(loop)
         age_s = loop.frame_age_s()
         age_ms = None if age_s is None else age_s * 1e3
         if age_ms is None and self._last is not None:
             age_ms = self._last.latency_ms["capture_age"]
-        camera = _status("camera", faults, "frames arrive")
+        camera, picture = _status("camera", faults, "frames arrive"), loop.monitor.picture
         return HealthMessage(
             timestamp=rfc3339(self._wall()),
             state=_shown(signal) if signal else "FAULT",
@@ -148,12 +155,19 @@ class Telemetry:
                 detail=camera.detail,
                 capture_age_ms=None if age_ms is None else json_number(age_ms, 1),
             ),
+            picture=_status("picture", faults, "good"),
+            checks=[check_status(verdict) for verdict in picture.verdicts],
+            drift=None if picture.drift is None else drift_status(picture.drift),
             detector=_status("detector", faults, "answers"),
             light=_status("light", faults, light),
             faults=list(fault_texts(faults)),
             fault_codes=[fault.code for fault in faults],
             counters=self._counters(loop),
         )
+
+    def _faults(self, loop: Loop) -> tuple[Fault, ...]:
+        """Those beside the signal, and the notices."""
+        return (*(self._signal.faults if self._signal else ()), *loop.monitor.notices())
 
     def _counters(self, loop: Loop) -> Counters:
         counts = loop.counts
@@ -185,6 +199,9 @@ class Telemetry:
                 mqtt_connected=self._mqtt is not None and self._mqtt.status.connected,
                 light_errors=light_errors,
                 counters=self._counters(loop),
+                fault_codes=[fault.code for fault in self._faults(loop)],
+                verdicts=loop.monitor.picture.verdicts,
+                drift=loop.monitor.picture.drift,
             )
 
     def _due(self, now_s: float) -> float:
@@ -204,6 +221,7 @@ def event_line_for(result: FrameResult) -> EventLine:
         detections=result.detections,
         latency_ms=result.latency_ms,
         light=_shown(result.signal),
+        faults=result.signal.faults,
     )
 
 

@@ -18,6 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.errors import TelemetryError
+from bikeped.faults import Fault
+from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry import schema as messages
 from bikeped.telemetry.schema import EventHeader, EventLine, EventTrack, KindLabel, ShownState
 from bikeped.types import Decision, Detections, FloatArray, Kind, KindArray, Tracks
@@ -98,6 +101,24 @@ def track_records(tracks: Tracks) -> list[EventTrack]:
     ]
 
 
+def check_status(verdict: Verdict) -> messages.CheckStatus:
+    """A check of the picture as it stands in the health message."""
+    return messages.CheckStatus(
+        code=verdict.code,
+        value=json_number(verdict.value, 4),
+        threshold=json_number(verdict.threshold, 4),
+        hold_s=verdict.hold_s,
+        active=verdict.active,
+    )
+
+
+def drift_status(drift: Drift) -> messages.DriftStatus:
+    """The camera's drift as it stands in the health message."""
+    values = {name: getattr(drift, name) for name in messages.DriftStatus.__struct_fields__}
+    numbers = {k: json_number(v, 3) for k, v in values.items() if not isinstance(v, bool)}
+    return messages.DriftStatus(**{**values, **numbers})
+
+
 def event_line(
     *,
     t_s: float,
@@ -107,6 +128,7 @@ def event_line(
     detections: Detections,
     latency_ms: Mapping[str, float],
     light: ShownState | None = None,
+    faults: Sequence[Fault] = (),
 ) -> EventLine:
     """The event line of one frame, `t_s` seconds after the start.
 
@@ -119,6 +141,10 @@ def event_line(
         frame=frame,
         state=_state(decision),
         light=light or _state(decision),
+        faults=[
+            messages.EventFault(source=fault.source, code=fault.code, detail=fault.detail)
+            for fault in faults
+        ],
         pair=None if pair is None else (pair.cyclist_id, pair.pedestrian_id),
         tracks=track_records(finite_tracks(tracks)),
         detections=[

@@ -7,12 +7,14 @@ Prometheus counts in seconds, so durations are converted from milliseconds here 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Enum, Gauge, Histogram
 
+from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.schema import Counters, ShownState
 from bikeped.types import Detections, Kind, Tracks
@@ -52,6 +54,14 @@ class Metrics:
         self._capture_age = Gauge("capture_age_seconds", "Age of the newest frame", **new)
         self._fps = Gauge("fps", "Frames processed per second", **new)
         self._faults = Gauge("faults", "Active faults that the light shows", **new)
+        self._fault = Gauge("fault", "1 while a fault of this code is present", ["code"], **new)
+        check = {"labelnames": ["check"], **new}
+        self._checks = {
+            "value": Gauge("check_value", "Newest value of a check of the picture", **check),
+            "threshold": Gauge("check_threshold", "The value that may not be reached", **check),
+            "active": Gauge("check_active", "1 while the check stops or withholds", **check),
+        }
+        self._drift = Gauge("drift", "The camera against its reference", ["measure"], **new)
         self._mqtt_connected = Gauge("mqtt_connected", "1 while the broker is connected", **new)
         # Label lookups take a lock and a dictionary each; done once, and zeros are visible early.
         self._stage = {stage: latency.labels(stage) for stage in STAGES}
@@ -63,6 +73,7 @@ class Metrics:
             "light_errors": Counter("light_faults", "Failures to drive the light", **new),
             **{key: Counter(name, text, **new) for key, (name, text) in _TOTALS.items()},
         }
+        self._fault_codes: set[str] = set()  # seen so far: a gauge that was 1 goes back to 0
         self._totals = dict.fromkeys(self._counters, 0)
 
     def count_frame(
@@ -93,6 +104,9 @@ class Metrics:
         mqtt_connected: bool,
         light_errors: int,
         counters: Counters,
+        fault_codes: Sequence[str] = (),
+        verdicts: Sequence[Verdict] = (),
+        drift: Drift | None = None,
     ) -> None:
         """Sets the gauges, and brings the counters up to totals counted elsewhere.
 
@@ -102,6 +116,14 @@ class Metrics:
         self._capture_age.set(math.nan if capture_age_s is None else capture_age_s)
         self._faults.set(faults)
         self._mqtt_connected.set(mqtt_connected)
+        for code in {*self._fault_codes, *fault_codes}:
+            self._fault.labels(code).set(code in fault_codes)
+        self._fault_codes.update(fault_codes)
+        for verdict in verdicts:
+            for field, gauge in self._checks.items():
+                gauge.labels(verdict.code).set(getattr(verdict, field))
+        for measure in ("pixels", "degrees", "metres_at_10m"):
+            self._drift.labels(measure).set(getattr(drift, measure, math.nan))
         for key, counter in self._counters.items():
             total = light_errors if key == "light_errors" else getattr(counters, key)
             if total > self._totals[key]:

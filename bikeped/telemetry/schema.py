@@ -118,6 +118,32 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True):
     audit_dropped: Annotated[Count, Meta(description="event lines not written to the audit log")]
 
 
+class CheckStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One check of the picture: its number now, and from where on it counts."""
+
+    code: str
+    value: Annotated[float | None, Meta(description="null while it cannot be measured")]
+    threshold: Annotated[float | None, Meta(description="the value that may not be reached")]
+    hold_s: Annotated[float, Meta(description="for so long it must be reached")]
+    active: bool
+
+
+class DriftStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """How far the camera is from where it was aligned; null before it was measured."""
+
+    pixels: Annotated[float | None, Meta(description="median over the picture, sensor pixels")]
+    degrees: float | None
+    pitch_deg: float | None
+    heading_deg: float | None
+    roll_deg: float | None
+    shift_m: float | None
+    metres_at_10m: Annotated[
+        float | None, Meta(description="largest error of a place 10 m away: 0.3 warns, 1.0 stops")
+    ]
+    judged: Annotated[bool, Meta(description="whether the newest picture could be compared")]
+    since_start: Annotated[bool, Meta(description="no alignment saved a reference")]
+
+
 class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
     """`bikeped/<site>/health`, every 10 s by default, retained."""
 
@@ -129,6 +155,9 @@ class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
     fps: Annotated[float, Meta(ge=0)]
     latency_ms: Annotated[dict[str, StageLatency], Meta(description="by stage")]
     camera: CameraHealth
+    picture: ComponentStatus
+    checks: Annotated[list[CheckStatus], Meta(description="of the picture, each with its number")]
+    drift: DriftStatus | None
     detector: ComponentStatus
     light: ComponentStatus
     faults: Annotated[list[str], Meta(description="what is wrong, one line each; empty: nothing")]
@@ -147,6 +176,14 @@ class EventHeader(msgspec.Struct, frozen=True, kw_only=True):
     model_hash: str | None
     version: str
     started_at: Timestamp
+
+
+class EventFault(msgspec.Struct, frozen=True, kw_only=True):
+    """One fault of an event line."""
+
+    source: str
+    code: str
+    detail: str
 
 
 class EventTrack(msgspec.Struct, frozen=True, kw_only=True):
@@ -178,6 +215,7 @@ class EventLine(msgspec.Struct, frozen=True, kw_only=True):
     frame: Count
     state: Annotated[ShownState, Meta(description="what was decided")]
     light: Annotated[ShownState, Meta(description="what the light showed: FAULT may cover state")]
+    faults: Annotated[list[EventFault], Meta(description="those that the light showed or held")]
     pair: Pair | None
     tracks: list[EventTrack]
     detections: list[EventDetection]

@@ -18,6 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.errors import TelemetryError
+from bikeped.faults import Fault
+from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry import builders as m
 from bikeped.telemetry import schema as wire
 from bikeped.types import Decision, Detections, PairMetrics, State, Tracks
@@ -76,6 +79,7 @@ def tracks_message(**changes) -> wire.TracksMessage:
     return m.tracks_message(**{**values, **changes})
 
 
+BLURRED = Verdict("picture.blurred", 1.23456, 1.0, 2.5, True, "The picture is blurred.")
 HEALTH = wire.HealthMessage(
     timestamp=m.rfc3339(NOON),
     state="FAULT",
@@ -87,6 +91,9 @@ HEALTH = wire.HealthMessage(
     camera=wire.CameraHealth(ok=False, detail="no frame for 2 s", capture_age_ms=None),
     detector=wire.ComponentStatus(ok=True, detail="onnxruntime, CPU"),
     light=wire.ComponentStatus(ok=True, detail="gpio"),
+    picture=wire.ComponentStatus(ok=False, detail="The picture is blurred."),
+    checks=[m.check_status(BLURRED)],
+    drift=m.drift_status(Drift(pixels=4.5678, degrees=0.3, metres_at_10m=0.16)),
     faults=["camera: no frame for 2 s"],
     fault_codes=["camera.no_frame"],
     counters=COUNTERS,
@@ -139,6 +146,8 @@ REAL = {
             HEALTH,
             camera=wire.CameraHealth(ok=True, detail="frames arrive", capture_age_ms=12.0),
             latency_ms={},
+            checks=[],
+            drift=None,
             faults=[],
             fault_codes=[],
         ),
@@ -201,10 +210,17 @@ def test_a_track_without_finite_numbers_or_history_is_left_out_of_the_map():
     assert [track.id for track in event_line(tracks=bad).tracks] == [7]
 
 
+def test_the_numbers_of_checks_and_drift():
+    health = json.loads(m.encode(HEALTH))
+    blurred = {"code": "picture.blurred", "value": 1.2346, "threshold": 1.0}
+    assert health["checks"] == [{**blurred, "hold_s": 2.5, "active": True}]
+    assert (health["drift"]["pixels"], health["drift"]["roll_deg"]) == (4.568, None)
+
+
 def test_event_line_exactly_and_in_order():
     line = m.encode_line(event_line())
     assert line == (
-        b'{"t":1.2346,"frame":42,"state":"ALERT","light":"ALERT","pair":[7,3],"tracks":['
+        b'{"t":1.2346,"frame":42,"state":"ALERT","light":"ALERT","faults":[],"pair":[7,3],"tracks":['
         b'{"id":3,"kind":"pedestrian","x":3.0,"y":4.0,"vx":0.0,"vy":0.0,"lost":true},'
         b'{"id":7,"kind":"cyclist","x":0.0,"y":12.346,"vx":3.0,"vy":-4.0,"lost":false}],'
         b'"detections":[{"kind":"cyclist","confidence":0.1,"box":[1.0,2.1,3.0,4.0]}],'
@@ -215,8 +231,11 @@ def test_event_line_exactly_and_in_order():
 
 
 def test_the_light_of_an_event_line_may_differ_from_the_decision():
-    line = event_line(light="FAULT")
+    line = event_line(light="FAULT", faults=[Fault("camera", "camera.error", "unplugged")])
     assert (line.state, line.light, line.pair) == ("ALERT", "FAULT", (7, 3))
+    assert line.faults == [
+        wire.EventFault(source="camera", code="camera.error", detail="unplugged")
+    ]
 
 
 def test_event_header_and_the_keys_that_interfaces_promise():

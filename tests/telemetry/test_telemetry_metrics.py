@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from prometheus_client import REGISTRY
 
+from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.schema import Counters
 from bikeped.types import Detections, Tracks
@@ -114,3 +116,18 @@ def test_two_services_in_one_process_do_not_meet():
     assert value(first, "frames_undecodable_total") == 1
     assert value(second, "frames_undecodable_total") == 0
     assert REGISTRY.get_sample_value("bikeped_frames_undecodable_total") is None
+
+
+def test_checks_drift_and_faults_by_code():
+    metrics = Metrics()
+    blurred = Verdict("picture.blurred", 1.5, 1.0, 2.5, True, "The picture is blurred.")
+    drift = Drift(pixels=30.0, degrees=2.0, metres_at_10m=1.1)
+    update(metrics, fault_codes=["camera.moved"], verdicts=[blurred], drift=drift)
+    assert value(metrics, "fault", code="camera.moved") == 1
+    assert value(metrics, "check_value", check="picture.blurred") == 1.5
+    assert value(metrics, "check_threshold", check="picture.blurred") == 1
+    assert value(metrics, "check_active", check="picture.blurred") == 1
+    assert value(metrics, "drift", measure="metres_at_10m") == 1.1
+    update(metrics)
+    assert value(metrics, "fault", code="camera.moved") == 0
+    assert math.isnan(value(metrics, "drift", measure="pixels") or 0)

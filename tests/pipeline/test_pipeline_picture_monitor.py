@@ -11,7 +11,7 @@ from bikeped.config.load import load_config
 from bikeped.errors import ConfigError
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
 from bikeped.lab.rendering.dataset import random_scenario
-from bikeped.pipeline.drift import drift_check
+from bikeped.pipeline.picture_monitor import drift_check
 from bikeped.types import ImageArray
 from bikeped.web.align_save import REFERENCE, file_hash, save
 
