@@ -25,7 +25,10 @@ _SMOOTH_S = 0.4  #: time constant of the picture that is compared: takes off noi
 #: A tile without structure has changed when its brightness, in proportion to that of the tiles
 #: that are recognised, is off by so many grey levels and by this share.
 _CHANGED, _CHANGED_SHARE = 25.0, 0.3
-_AREA = 0.8  #: of the whole picture hidden counts as all structures lost
+#: An even patch (within so many grey levels) hides the scene when it covers so much of the picture,
+#: and hides this share of the known structures, or has another brightness over this share of the
+#: picture.
+_PATCH_LEVELS, _PATCH_AREA, _PATCH_STRUCTURES, _PATCH_CHANGED = 15.0, 0.38, 0.12, 0.3
 _FEW = 8  #: tiles with structure, below which nothing can be said
 
 
@@ -51,9 +54,10 @@ class KnownScene:
         return band, np.sqrt(np.square(band).mean(axis=-1))
 
     def update(self, coarse: ImageArray, passed_s: float, covered: bool, learn: bool) -> float:
-        """Share of the known structures that are lost; those hidden by something blank count twice.
+        """How much of the scene is hidden: 0.5 is half of the known structures.
 
-        As much counts a blank part of the picture in other brightness, where no structure was.
+        Those hidden by something blank count half as much again; an even patch over 38 % of the
+        picture counts as half of them.
         `passed_s` since the last picture; `covered`: the picture counts as covered already;
         `learn`: nothing is wrong with it. NaN where too little is known.
         """
@@ -76,7 +80,7 @@ class KnownScene:
         usual = np.maximum(gain * self._means, 1.0)
         off = np.abs(means - usual) > np.maximum(_CHANGED, _CHANGED_SHARE * usual)
         flat = known & ~judged & self._region & (deviation < _STRUCTURE)
-        hidden = (blank | (flat & off)).sum() / self._region.sum()
+        hidden = blank | (flat & off)
         self._lost_s = np.where(found & ~off, 0.0, self._lost_s + passed_s).astype(np.float32)
         patience_s = _NEW_LOOK_COVERED_S if covered else _NEW_LOOK_S
         self._adopt(look, deviation, 0, ~known & ~found)
@@ -92,7 +96,30 @@ class KnownScene:
                 self._follow(look, slot, found & (best == slot), passed_s)
         if judged.sum() < _FEW:
             return float("nan")
-        return float(max((lost.sum() + blank.sum()) / judged.sum(), hidden / _AREA))
+        share = (lost.sum() + 0.5 * blank.sum()) / judged.sum()
+        return float(max(share, self._patch(hidden, blank, deviation, means, int(judged.sum()))))
+
+    def _patch(
+        self,
+        hidden: BoolArray,
+        blank: BoolArray,
+        deviation: Float32Array,
+        means: Float32Array,
+        judged: int,
+    ) -> float:
+        """As `update`, of the largest even patch that hides something."""
+        if not hidden.any():
+            return 0.0
+        level = np.median(means[hidden])
+        even = self._region & (deviation < _STRUCTURE) & (np.abs(means - level) < _PATCH_LEVELS)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(even.astype(np.uint8))
+        if len(stats) < 2:
+            return 0.0
+        patch = labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+        area = patch.sum() / self._region.sum() / _PATCH_AREA
+        lost = (patch & blank).sum() / judged / _PATCH_STRUCTURES
+        changed = (patch & hidden).sum() / self._region.sum() / _PATCH_CHANGED
+        return 0.5 * float(min(area, max(lost, changed)))
 
     def _adopt(
         self, look: Float32Array, deviation: Float32Array, slot: int, where: BoolArray

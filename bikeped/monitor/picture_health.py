@@ -29,10 +29,11 @@ _FLAT = (
     8.0,
 )  #: grey levels between the tiles of a dark, and of another, picture of one colour
 _DARK, _BRIGHT = 20.0, 235.0
-_LOST = 0.5  #: share of the known structures
+_LOST = 0.5  #: of the known structures (`KnownScene`)
 _BLURRED = 1.2  #: sharpness (`Sharpness`) that is too little at any site
-_BLURRED_SHARE = 0.35  #: of the site's own above 1
-_SPRAYED = 0.15  #: share of the parts
+_BLURRED_SHARE = 0.4  #: of the site's own above 1
+#: Share of the parts: at least the first, and the second above 1.1 times the site's own.
+_SPRAYED = (0.11, 0.07)
 _UNDEREXPOSED = 25.0  #: grey levels of the brightest tenth
 _CLIPPED, _OVEREXPOSED = 250.0, 0.35  #: grey levels, and the share of the picture above them
 _CODES = (
@@ -148,7 +149,10 @@ class PictureHealth:
             "one_colour": (even if _DARK <= middle <= _BRIGHT else 0.0, 1.0),
             "covered": (lost, _LOST),
             "blurred": (blurred / max(sharp, 0.01) * flatness, 1.0),
-            "spray": (sprayed * flatness, _SPRAYED),
+            "spray": (
+                sprayed * flatness,
+                max(_SPRAYED[0], _SPRAYED[1] + 1.1 * self._sharpness.usual_share),
+            ),
             "underexposed": (_UNDEREXPOSED / max(float(np.quantile(means, 0.9)), 0.1), 1.0),
             "overexposed": (float((levels > _CLIPPED).mean()), _OVEREXPOSED),
         }

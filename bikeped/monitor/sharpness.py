@@ -7,6 +7,8 @@ The energy of noise, known from the change since the last picture, is taken off 
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
@@ -22,7 +24,7 @@ _WEAK = 0.05  #: squared grey levels a pixel: without slopes nothing can be said
 _SHARP = 1.3  #: a part that has been sharper than this can be seen to lose it
 #: A part is blurred below these shares, of its usual sharpness and of its usual energy of fine
 #: slopes; both in proportion to the whole picture's: light and weather change them everywhere.
-_PART_SHARP, _PART_LEFT = 0.75, 0.5
+_PART_SHARP, _PART_LEFT = 0.85, 0.65
 _FEW = 8
 _KNOWN_S = 2.0
 _FORGET_S = 60.0
@@ -42,12 +44,18 @@ class Sharpness:
         self._pictures = 0
         self._seen_s = 0.0
         self._usual = 1.0
+        self._usual_share = 0.0
         self._usual_energy = np.zeros((2, *GRID), np.float32)
 
     @property
     def usual(self) -> float:
         """The site's own sharpness; NaN before it is known."""
         return self._usual if self._seen_s >= _KNOWN_S else float("nan")
+
+    @property
+    def usual_share(self) -> float:
+        """Share of parts that count as blurred while nothing is wrong: rain, noise."""
+        return self._usual_share
 
     def update(self, lines: ImageArray, passed_s: float, learn: bool) -> tuple[float, float]:
         """Sharpness of the whole picture, and the share of its parts that lost theirs; or NaN.
@@ -59,12 +67,15 @@ class Sharpness:
         strong = self._strong(wide)
         if strong.sum() < 2 or self._pictures < 2:
             return float("nan"), float("nan")
-        sharp = float(fine[strong].sum() / wide[strong].sum())
+        best = strong & (wide >= np.quantile(wide[strong], 0.5))
+        sharp = float(fine[best].sum() / wide[best].sum())
         share, lost = self._lost(np.maximum(self._parts - self._noise[:, None, None], 0.0), sharp)
         if learn:
             self._seen_s += passed_s
             weight = min(1.0, passed_s / min(self._seen_s, _FORGET_S))
             self._usual += weight * (sharp - self._usual)
+            if not math.isnan(share):
+                self._usual_share += weight * (share - self._usual_share)
             self._usual_energy += weight * np.where(lost, 0, energy - self._usual_energy)
         return sharp, share
 
