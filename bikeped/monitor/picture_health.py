@@ -30,10 +30,10 @@ _FLAT = (
 )  #: grey levels between the tiles of a dark, and of another, picture of one colour
 _DARK, _BRIGHT = 20.0, 235.0
 _LOST = 0.5  #: of the known structures (`KnownScene`)
-_BLURRED = 1.2  #: sharpness (`Sharpness`) that is too little at any site
+_BLURRED = 1.25  #: sharpness (`Sharpness`) that is too little at any site
 _BLURRED_SHARE = 0.4  #: of the site's own above 1
 #: Share of the parts: at least the first, and the second above 1.1 times the site's own.
-_SPRAYED = (0.11, 0.07)
+_SPRAYED = (0.1, 0.06)
 _UNDEREXPOSED = 25.0  #: grey levels of the brightest tenth
 _CLIPPED, _OVEREXPOSED = 250.0, 0.35  #: grey levels, and the share of the picture above them
 _CODES = (
@@ -127,11 +127,11 @@ class PictureHealth:
         # As a share, so that larger is worse: 1 is as even as a picture of one colour.
         even = flat / max(spread, 0.01)
         before = {v.code: v for v in self._verdicts}
-        wrong = (
-            any(v.beyond or v.active for c, v in before.items() if not c.endswith("exposed"))
-            or even >= 1.0
-            or still_s > _FROZEN_S / 2
-        )
+        # Never learn a fault as usual. Spray alone may build up to its own limit.
+        wrong = even >= 1.0 or still_s > _FROZEN_S / 2
+        for code in ("black", "white", "one_colour", "covered", "blurred", "spray"):
+            verdict = before[f"picture.{code}"]
+            wrong = wrong or verdict.active or (verdict.beyond and code != "spray")
         covered = before["picture.covered"]
         lost = self._scene.update(
             picture.coarse, passed_s, covered.active or covered.beyond, not wrong

@@ -109,7 +109,7 @@ class RepeatedPictures:
 def _samples(rgb: ImageArray) -> ImageArray:
     """Green at places all over the picture and two pixels beside them [2, n]."""
     rows, columns = _places(*rgb.shape[:2])
-    return rgb[rows, columns, 1]
+    return np.asarray(rgb[rows, columns, 1], np.uint8)
 
 
 @lru_cache(maxsize=4)

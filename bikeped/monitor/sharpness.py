@@ -2,7 +2,7 @@
 
 Sharpness is the energy of slopes along the rows after a narrow smoothing over that after one twice
 as wide: about 2 for a sharp picture, 1 for a blurred one, whatever its brightness and contrast.
-The energy of noise, known from the change since the last picture, is taken off both.
+Only what two pictures, one after the other, have in common counts: not noise, not falling rain.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GRID = (20, 32)  #: rows and columns of parts
 _SIGMAS = (1.0, 2.0)  #: pixels of `Reduced.lines`
 _ROWS = 80  #: lines that are enough
 _SMOOTH_S = 0.3  #: time constant of the whole picture's sharpness,
-_PARTS_SMOOTH_S = 2.0  #: and of the parts', which is noisier
+_PARTS_SMOOTH_S = 1.5  #: and of the parts', which is noisier
 _WEAK = 0.05  #: squared grey levels a pixel: without slopes nothing can be said
 _SHARP = 1.3  #: a part that has been sharper than this can be seen to lose it
 #: A part is blurred below these shares, of its usual sharpness and of its usual energy of fine
@@ -27,6 +27,8 @@ _SHARP = 1.3  #: a part that has been sharper than this can be seen to lose it
 _PART_SHARP, _PART_LEFT = 0.85, 0.65
 _FEW = 8
 _KNOWN_S = 2.0
+_SHARE_FORGET_S = 40.0
+_SHARE_MOST = 0.12  #: blurred parts are usual up to this share, and a fault beyond it
 _FORGET_S = 60.0
 _KERNELS = [cv2.getGaussianKernel(2 * int(3 * s) + 1, s).astype(np.float32) for s in _SIGMAS]
 _ONE = np.ones(1, np.float32)
@@ -40,7 +42,6 @@ class Sharpness:
         self._before: list[Float32Array] = []
         self._energy = np.zeros((2, *GRID), np.float32)
         self._parts = np.zeros((2, *GRID), np.float32)
-        self._noise = np.zeros(2, np.float32)
         self._pictures = 0
         self._seen_s = 0.0
         self._usual = 1.0
@@ -63,25 +64,29 @@ class Sharpness:
         `learn`: nothing is wrong with the picture.
         """
         self._measure(lines, passed_s)
-        fine, wide = energy = np.maximum(self._energy - self._noise[:, None, None], 0.0)
+        fine, wide = energy = np.maximum(self._energy, 0.0)
         strong = self._strong(wide)
         if strong.sum() < 2 or self._pictures < 2:
             return float("nan"), float("nan")
         best = strong & (wide >= np.quantile(wide[strong], 0.5))
         sharp = float(fine[best].sum() / wide[best].sum())
-        share, lost = self._lost(np.maximum(self._parts - self._noise[:, None, None], 0.0), sharp)
+        share, lost = self._lost(np.maximum(self._parts, 0.0), sharp)
         if learn:
             self._seen_s += passed_s
-            weight = min(1.0, passed_s / min(self._seen_s, _FORGET_S))
+            # The mean of the first seconds, then slowly: drops come within a second.
+            constant_s = self._seen_s if self._seen_s <= _KNOWN_S else _FORGET_S
+            weight = min(1.0, passed_s / constant_s)
             self._usual += weight * (sharp - self._usual)
             if not math.isnan(share):
-                self._usual_share += weight * (share - self._usual_share)
+                quick = min(1.0, passed_s / min(self._seen_s, _SHARE_FORGET_S))
+                self._usual_share += quick * (share - self._usual_share)
+                self._usual_share = min(self._usual_share, _SHARE_MOST)
             self._usual_energy += weight * np.where(lost, 0, energy - self._usual_energy)
         return sharp, share
 
     def _strong(self, wide: Float32Array) -> BoolArray:
         """Parts with edges: the better half of those inside the circle."""
-        least = max(float(np.median(wide[self._region])), float(self._noise[1]), _WEAK)
+        least = max(float(np.median(wide[self._region])), _WEAK)
         return np.asarray(self._region & (wide >= least))
 
     def _lost(self, energy: Float32Array, sharp: float) -> tuple[float, BoolArray]:
@@ -100,20 +105,17 @@ class Sharpness:
         return float(lost.sum() / judged.sum()), lost
 
     def _measure(self, lines: ImageArray, passed_s: float) -> None:
-        """Updates the energies of slopes and of noise."""
+        """Updates the energies of slopes."""
         few = np.asarray(lines[:: max(1, lines.shape[0] // _ROWS)])
         slopes = [_slopes(few, kernel) for kernel in _KERNELS]
-        energy = np.stack([_energy(slope) for slope in slopes])
-        weight = (
-            np.float32(1.0 - np.exp(-passed_s / _SMOOTH_S)) if self._pictures else np.float32(1)
-        )
-        self._energy += weight * (energy - self._energy)
-        slow = np.float32(1.0 - np.exp(-passed_s / _PARTS_SMOOTH_S)) if self._pictures else weight
-        self._parts += slow * (energy - self._parts)
         if self._before:
-            change = [_energy(now - old) for now, old in zip(slopes, self._before, strict=True)]
-            noise = np.array([0.5 * np.median(part[self._region]) for part in change], np.float32)
-            self._noise += weight * (noise - self._noise)
+            pairs = zip(slopes, self._before, strict=True)
+            energy = np.stack([_common_energy(now, before) for now, before in pairs])
+            for mean, time_s in ((self._energy, _SMOOTH_S), (self._parts, _PARTS_SMOOTH_S)):
+                first = self._pictures == 1
+                mean += np.float32(1.0 if first else 1.0 - np.exp(-passed_s / time_s)) * (
+                    energy - mean
+                )
         self._before = slopes
         self._pictures += 1
 
@@ -123,10 +125,14 @@ def _slopes(lines: ImageArray, kernel: Float32Array) -> Float32Array:
     return np.asarray(smooth[:, 2:] - smooth[:, :-2], np.float32)
 
 
-def _energy(slopes: Float32Array) -> Float32Array:
-    """Variance of the slopes in every part [20, 32]: an even shading has none."""
-    tall, wide = slopes.shape[0] // GRID[0], slopes.shape[1] // GRID[1]
-    cut = np.ascontiguousarray(slopes[: tall * GRID[0], : wide * GRID[1]])
-    mean = cv2.resize(cut, GRID[::-1], interpolation=cv2.INTER_AREA)
-    square = cv2.resize(cv2.multiply(cut, cut), GRID[::-1], interpolation=cv2.INTER_AREA)
-    return np.asarray(square - np.square(mean), np.float32)
+def _common_energy(now: Float32Array, before: Float32Array) -> Float32Array:
+    """Covariance of the slopes of two pictures in every part [20, 32]; even shading has none."""
+    tall, wide = now.shape[0] // GRID[0], now.shape[1] // GRID[1]
+    cut = (slice(tall * GRID[0]), slice(wide * GRID[1]))
+    now, before = now[cut], before[cut]
+    means = [_mean_of_parts(part) for part in (now, before, now * before)]
+    return means[2] - means[0] * means[1]
+
+
+def _mean_of_parts(values: Float32Array) -> Float32Array:
+    return np.asarray(cv2.resize(values, GRID[::-1], interpolation=cv2.INTER_AREA), np.float32)

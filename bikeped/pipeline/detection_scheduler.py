@@ -98,7 +98,7 @@ class DetectionStage:
         self.detect = detector.detect
         self.max_inflight = detector.max_inflight if isinstance(detector, DetectorPool) else 1
         self._decode_size = detector.decode_size
-        self._view_width, self._picture_monitor = view_width, picture_monitor
+        self._view_width, self.picture_monitor = view_width, picture_monitor
         self._jpeg = JpegDecoder(buffers=FRAME_BUFFERS)
 
     def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> DecodedFrame:
@@ -114,8 +114,8 @@ class DetectionStage:
             rgb = self._jpeg.decode(frame.jpeg, min_width=width, min_height=height)
         decode_ms = (time.perf_counter() - began) * 1e3
         checks = NO_CHECKS
-        if self._picture_monitor is not None:
-            checks = self._picture_monitor.update(rgb, frame.captured_s)
+        if self.picture_monitor is not None:
+            checks = self.picture_monitor.update(rgb, frame.captured_s)
         return DecodedFrame(frame, rgb, received_s, acquire_ms, decode_ms, checks)
 
 

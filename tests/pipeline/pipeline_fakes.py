@@ -196,11 +196,11 @@ class Rig:
             self.light,  # type: ignore[arg-type]
             listeners=(self.recorder,),
         )
-        detection = DetectionStage(self.detector)
-        detection.max_inflight = self.max_inflight
+        self.detection = DetectionStage(self.detector)
+        self.detection.max_inflight = self.max_inflight
         self.loop = Loop(
             feed=self.feed,
-            detection=detection,
+            detection=self.detection,
             track_and_decide=self.track_and_decide,
             dispatcher=self.dispatcher,
             outputs=self.outputs,  # type: ignore[arg-type]

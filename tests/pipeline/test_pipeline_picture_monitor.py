@@ -1,18 +1,27 @@
-"""From a saved alignment to the service's drift check."""
+"""From the configuration to the checks of each picture, and from those to the light."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import simplejpeg
+from drawn_detectors import OracleDetector
+from pipeline_fakes import Rig
 
 from bikeped.config.load import load_config
 from bikeped.errors import ConfigError
+from bikeped.faults import Effect
 from bikeped.lab.rendering import Conditions, ScenePainter, scene_camera
+from bikeped.lab.rendering.clip import AviWriter
 from bikeped.lab.rendering.dataset import random_scenario
-from bikeped.pipeline.picture_monitor import drift_check
-from bikeped.types import ImageArray
+from bikeped.monitor.picture_health import PictureHealth
+from bikeped.monitor.verdicts import Verdict
+from bikeped.pipeline.picture_monitor import UNCHECKED, PictureChecks, drift_check, picture_monitor
+from bikeped.pipeline.replay import replay
+from bikeped.types import Detections, ImageArray
 from bikeped.web.align_save import REFERENCE, file_hash, save
 
 ROOT = Path(__file__).parents[2]
@@ -88,3 +97,85 @@ def test_a_reference_that_does_not_fit_is_named_with_the_remedy(place: Path) -> 
     saved.reference.unlink()
     with pytest.raises(ConfigError, match=r"camera\.reference: camera_reference\.json cannot be"):
         drift_check(load_config(place))
+
+
+def replayed(place: Path, pictures: list[ImageArray], folder: Path) -> list[dict[str, object]]:
+    """The frames' event lines of a replay of `pictures` at 30 frames/s; nobody is detected."""
+    clip, events = folder / "clip.avi", folder / "events.jsonl"
+    with AviWriter(clip, 30, (480, 270)) as writer:
+        for rgb in pictures:
+            writer.write(simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=90))
+    nobody = OracleDetector(lambda number: Detections.empty())
+    replay(load_config(place), str(clip), detector=nobody, events=events)
+    return [json.loads(line) for line in events.read_text().splitlines()[1:]]
+
+
+def test_a_recording_is_judged_on_its_own_time(place: Path, tmp_path: Path) -> None:
+    loaded = load_config(place)
+    painter = ScenePainter(
+        random_scenario(1), scene_camera(loaded, (480, 270)), Conditions(place=5)
+    )
+    good = [painter.frame(number / 30) for number in range(60)]
+    lines = replayed(place, good + [np.zeros_like(good[0])] * 45, tmp_path)
+    assert {line["light"] for line in lines[10:60]} == {"IDLE"}
+    assert not any(line["faults"] for line in lines[10:60])
+    black = {"source": "picture", "code": "picture.black", "detail": "The picture is black."}
+    assert lines[90]["light"] == "FAULT"
+    assert black in lines[90]["faults"]  # type: ignore[operator]
+
+
+class Checks:
+    """A picture monitor that says what the test wants."""
+
+    def __init__(self, checks: PictureChecks) -> None:
+        self.checks = checks
+
+    def update(self, rgb: ImageArray, time_s: float) -> PictureChecks:
+        return self.checks
+
+
+def active(code: str) -> PictureChecks:
+    return PictureChecks((Verdict(code, 2.0, 1.0, 0.0, True, f"{code} it is"),))
+
+
+async def test_what_each_effect_does_to_the_light() -> None:
+    checks = Checks(PictureChecks())
+    async with Rig() as rig:
+        rig.detection.picture_monitor = checks  # type: ignore[assignment]
+        await rig.frames(6)
+        assert rig.recorder.name == "IDLE"
+        checks.checks = active("picture.underexposed")
+        await rig.frames(1)
+        assert rig.recorder.name == "IDLE"
+        assert [fault.code for fault in rig.loop.monitor.notices()] == ["picture.underexposed"]
+        checks.checks = active("picture.blurred")
+        await rig.frames(1)
+        assert rig.recorder.name == "FAULT"
+        assert rig.recorder.faults == ("picture: picture.blurred it is",)
+        checks.checks = PictureChecks()
+        await rig.frames(1)  # withheld only: the good frames before it still count
+        assert rig.recorder.name == "IDLE"
+        checks.checks = active("picture.covered")
+        await rig.frames(1)
+        checks.checks = PictureChecks()
+        await rig.frames(1)
+        assert rig.recorder.name == "FAULT"
+        assert rig.recorder.faults[0].startswith("recovering: ")
+
+
+def test_a_bug_in_the_checks_withholds_and_does_not_raise(
+    place: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monitor = picture_monitor(load_config(place))
+    assert monitor is not None
+    monkeypatch.setattr(PictureHealth, "update", lambda *_: 1 / 0)
+    [fault] = monitor.update(picture(place), 0.0).faults()
+    assert fault.code == "picture.check_failed"
+    assert fault.kind.effect is Effect.WITHHELD
+    assert "division by zero" in caplog.text
+
+
+def test_switched_off_it_is_named(place: Path) -> None:
+    loaded = load_config(place, ["monitor.picture=false"])
+    assert picture_monitor(loaded) is None
+    assert UNCHECKED.kind.effect is Effect.NOTICE
