@@ -17,6 +17,7 @@ import numpy as np
 import onnx
 import pytest
 import simplejpeg
+from hypothesis import settings
 from onnx import TensorProto, helper, numpy_helper
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
@@ -25,6 +26,10 @@ from bikeped.lab.rendering.clip import AviWriter
 
 #: `serve`, `open_page` and a headless Chromium, for the pages of device and lab.
 pytest_plugins = ["browser_fixtures"]
+
+# No test judges time: a busy machine is slow.
+settings.register_profile("bikeped", deadline=None)
+settings.load_profile("bikeped")
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
 DEADLINE_S = 30.0  # generous: reached only by a failure
