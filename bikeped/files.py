@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +62,21 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         partial.replace(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def read_regular(path: Path, most_bytes: int = 1_000_000) -> bytes:
+    """The bytes of a regular file of at most `most_bytes`.
+
+    Never waits: a pipe or a device, which may deliver nothing or have no end, is refused. Raises
+    OSError, whose `strerror` says what is wrong.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is not a regular file")
+    with path.open("rb") as file:
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise OSError(errno.EFBIG, f"it is larger than {most_bytes / 1e6:g} MB")
+    return data
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

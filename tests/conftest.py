@@ -317,6 +317,8 @@ def small_config(tmp_path: Path, small_model: Path) -> Callable[..., Path]:
     def make(source: Path | str = "/dev/video-none", more: str = "", model: object = None) -> Path:
         path = tmp_path / "small.yaml"
         text = SMALL_CONFIG.format(source=source, model=model or small_model)
+        if "feedback:" not in more:
+            more += "feedback: {light: simulated}\n"
         path.write_text(text + more, encoding="utf-8")
         return path
 

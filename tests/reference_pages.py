@@ -78,6 +78,11 @@ metres per second.
 **Paths.** A relative path starts at the folder of the configuration file, or, given with `--set`,
 at the working directory; `~` is the home directory.
 
+**Whole files.** The last line of a file is `complete: true`. A file that was cut off, by a full
+disk or a loss of power, lacks it: `bikeped config check` and `bikeped run` warn of a file without
+it. `bikeped run` wants `camera.source` and `feedback.light` in the file, and `feedback.gpio.chip`
+or `feedback.usb.device` beside them: what drives hardware has no silent default.
+
 **Numbers.** YAML reads `1e-3` as text: write `0.001`.
 """
 
@@ -90,11 +95,16 @@ def configuration_page() -> str:
         keys = key_descriptions(section)
         if not keys:
             continue
-        lines += [f"## {path}", "", " ".join((section.__doc__ or "").split()), ""]
+        lines += [f"## {path or 'top level'}", "", " ".join((section.__doc__ or "").split()), ""]
         lines += ["| key | values | default | meaning |", "| --- | --- | --- | --- |"]
         for key, text in keys.items():
             item = parts[section.__name__]["properties"][key]
-            row = (f"`{path}.{key}`", _values(item), f"`{_yaml(item['default'])}`", text)
+            row = (
+                f"`{path}.{key}`" if path else f"`{key}`",
+                _values(item),
+                f"`{_yaml(item['default'])}`",
+                text,
+            )
             lines.append(f"| {' | '.join(map(_escaped, row))} |")
         lines.append("")
     return "\n".join(lines)

@@ -11,6 +11,7 @@ from bikeped.cli.common import config_options, json_option, write_json
 from bikeped.cli.guard import guarded
 from bikeped.config.build import framing, ground_camera
 from bikeped.config.load import load_config
+from bikeped.config.runnable import check_runnable, warnings
 from bikeped.errors import ConfigError
 from bikeped.geometry.camera import GroundTable
 from bikeped.models import model_file
@@ -40,6 +41,11 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
         raise ConfigError(
             f"{loaded.source}: detection.model: {file} does not exist; correct the path"
         )
+    notes = list(warnings(loaded))
+    try:
+        check_runnable(loaded)
+    except ConfigError as error:
+        notes.append(f"`bikeped run` refuses it: {str(error).removeprefix(f'{loaded.source}: ')}")
     report = {
         "ok": True,
         "source": loaded.source,
@@ -47,6 +53,7 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
         "calibration_hash": loaded.calibration_hash,
         "focal_length_px": camera.lens.focal_px,
         "model": None if file is None else str(file),
+        "warnings": notes,
     }
     if json_path is not None:
         write_json(report, json_path)
@@ -58,6 +65,8 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
         )
         if model is None:
             click.echo("detection.model is not set: `bikeped run` needs one")
+        for note in notes:
+            click.echo(f"warning: {note}")
 
 
 @command.command("show")

@@ -24,12 +24,15 @@ from bikeped.cli.common import (
 )
 from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config.load import load_config
+from bikeped.config.runnable import check_runnable, warnings
 from bikeped.files import make_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from bikeped.pipeline.replay import ReplayResult
+
+log = logging.getLogger(__name__)
 
 
 @click.command("run")
@@ -41,6 +44,9 @@ def run(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
     root = logging.getLogger()
     root.setLevel(min(root.level, logging.INFO))
     loaded = load_config(config_path, overrides)
+    check_runnable(loaded)
+    for text in warnings(loaded):
+        log.warning("%s: %s", loaded.source, text)
     pages = None
     if loaded.config.web.enabled:  # else without the time and memory of its imports
         from bikeped.web.service_pages import ServicePages

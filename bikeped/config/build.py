@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 
-from bikeped.config.load import Calibration, LoadedConfig
+from bikeped.config.lens_check import Calibration
+from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig, TrackingConfig
 from bikeped.decision.rules import RuleSettings
 from bikeped.errors import ConfigError, GeometryError

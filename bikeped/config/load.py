@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import Meta
 
+from bikeped.config.lens_check import Calibration, check_calibration
 from bikeped.config.schema import Config, DecisionConfig
 from bikeped.config.strict_yaml import UNUSABLE, load_sections, load_yaml, one_line, read_text
 from bikeped.config.validate import check_together, to_config
 from bikeped.errors import CalibrationError, ConfigError
+from bikeped.files import read_regular
 from bikeped.models import BUNDLED
 
 _PATH_KEYS = (
@@ -22,30 +23,6 @@ _PATH_KEYS = (
     *("feedback.sound.chime", "feedback.sound.bell", "web.token_file"),
     *("mqtt.password_file", "mqtt.ca_file", "mqtt.cert_file", "mqtt.key_file"),
 )
-_Finite = Annotated[float, Meta(ge=-1e6, le=1e6)]
-_Side = Annotated[int, Meta(ge=1, le=100_000)]
-
-
-class Calibration(msgspec.Struct, frozen=True, kw_only=True):
-    """Intrinsics of one camera; lengths in pixels of the crop. Unknown keys are kept out."""
-
-    model: str
-    cx: _Finite
-    cy: _Finite
-    focal_length: Annotated[float, Meta(gt=0, le=1e6)]
-    fov_deg: Annotated[float, Meta(gt=0, le=360)]
-    radius_px: Annotated[float, Meta(gt=0, le=1e6)] | None = None
-    k1: _Finite = 0.0
-    k2: _Finite = 0.0
-    k3: _Finite = 0.0
-    k4: _Finite = 0.0
-    rms_error_px: _Finite | None = None
-    num_frames: int | None = None
-    num_points: int | None = None
-    frame_width: _Side | None = None
-    frame_height: _Side | None = None
-    pad_size: _Side | None = None
-    crop_size: _Side | None = None
 
 
 @dataclass(frozen=True)
@@ -53,7 +30,9 @@ class LoadedConfig:
     """A checked configuration with what it was made from.
 
     `source` names it in messages; relative paths in it start at `base_dir`. `hash` covers every
-    effective value, `calibration_hash` the calibration file's bytes (None without one).
+    effective value, `calibration_hash` the calibration file's bytes (None without one). `text` and
+    `calibration_data` are what was read; `named` are the keys, as `camera.source`, that the file or
+    an override gives.
     """
 
     config: Config
@@ -62,6 +41,9 @@ class LoadedConfig:
     hash: str
     calibration: Calibration | None
     calibration_hash: str | None
+    text: str = field(default="", repr=False)
+    calibration_data: bytes | None = field(default=None, repr=False)
+    named: frozenset[str] = frozenset()
 
     def path(self, relative: str) -> Path:
         """A path of the configuration, resolved against the folder of its file."""
@@ -90,20 +72,30 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Load
 
 
 def parse_config(
-    text: str, source: str, base_dir: Path, overrides: Sequence[str] = ()
+    text: str,
+    source: str,
+    base_dir: Path,
+    overrides: Sequence[str] = (),
+    calibration_file: Path | None = None,
 ) -> LoadedConfig:
-    """A configuration from YAML text; see `load_config`."""
+    """A configuration from YAML text; see `load_config`.
+
+    `calibration_file` is read in place of the one that `camera.calibration` names.
+    """
     data = load_sections(text, source)
     for override in overrides:
         _apply_override(data, override)
     where = source if not overrides else f"{source} with --set"
     config = to_config(data, where)
     check_together(config, where)
-    calibration, calibration_hash = None, None
+    calibration, calibration_data = None, None
     if config.camera.calibration is not None:
-        file = base_dir / _expanded(config.camera.calibration)
-        calibration, calibration_hash = load_calibration(file)
-        _check_calibration(config, calibration, str(file))
+        file = calibration_file or base_dir / _expanded(config.camera.calibration)
+        calibration, calibration_data = load_calibration(file)
+        check_calibration(calibration, config.camera, str(file))
+    calibration_hash = None
+    if calibration_data is not None:
+        calibration_hash = hashlib.sha256(calibration_data).hexdigest()
     return LoadedConfig(
         config=config,
         source=source,
@@ -111,13 +103,25 @@ def parse_config(
         hash=config_hash(config, calibration_hash),
         calibration=calibration,
         calibration_hash=calibration_hash,
+        text=text,
+        calibration_data=calibration_data,
+        named=frozenset(_names(data)),
     )
 
 
-def load_calibration(path: Path) -> tuple[Calibration, str]:
-    """The calibration and the SHA-256 of its file; CalibrationError names file, key and remedy."""
+def _names(data: dict[str, Any], path: str = "") -> Iterator[str]:
+    """The keys of nested sections as `section.key`."""
+    for name, value in data.items():
+        if isinstance(value, dict):
+            yield from _names(value, f"{path}{name}.")
+        else:
+            yield f"{path}{name}"
+
+
+def load_calibration(path: Path) -> tuple[Calibration, bytes]:
+    """The calibration and the bytes of its file; CalibrationError names file, key and remedy."""
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise CalibrationError(
             f"{path}: cannot be read ({error.strerror}); correct camera.calibration, or set it "
@@ -129,30 +133,7 @@ def load_calibration(path: Path) -> tuple[Calibration, str]:
         raise CalibrationError(
             f"{path}: {error}; compare it with the camera_calibration.json that comes with bikeped"
         ) from error
-    return calibration, hashlib.sha256(data).hexdigest()
-
-
-def _check_calibration(config: Config, calibration: Calibration, file: str) -> None:
-    """Checks that a calibration was made with the configured framing; ConfigError names `file`."""
-    camera = config.camera
-    for key, measured, configured in (
-        ("crop_size", calibration.crop_size, camera.crop_size),
-        ("pad_size", calibration.pad_size, camera.pad_size),
-        ("width", calibration.frame_width, camera.width),
-        ("height", calibration.frame_height, camera.height),
-    ):
-        if measured is not None and measured != configured:
-            raise ConfigError(
-                f"{file}: does not fit: camera.{key} is {configured}, the calibration was made "
-                f"with {measured}; set camera.{key}: {measured} or calibrate again"
-            )
-    if camera.crop_size is not None and not (
-        0 <= calibration.cx <= camera.crop_size and 0 <= calibration.cy <= camera.crop_size
-    ):
-        raise ConfigError(
-            f"{file}: does not fit: centre ({calibration.cx:g}, {calibration.cy:g}) lies outside "
-            f"the crop of {camera.crop_size} px; calibrate again with this crop"
-        )
+    return calibration, data
 
 
 def load_decision(path: Path, overrides: Sequence[str] = ()) -> DecisionConfig:
@@ -179,7 +160,9 @@ def parse_decision(text: str, source: str, overrides: Sequence[str] = ()) -> Dec
 
 def config_hash(config: Config, calibration_hash: str | None = None) -> str:
     """SHA-256 over every effective value and the calibration, independent of how it was written."""
-    digest = hashlib.sha256(msgspec.json.encode(config, order="deterministic"))
+    values = msgspec.to_builtins(config)
+    del values["complete"]  # says something of the file, nothing of what it sets
+    digest = hashlib.sha256(msgspec.json.encode(values, order="deterministic"))
     digest.update((calibration_hash or "").encode())
     return digest.hexdigest()
 

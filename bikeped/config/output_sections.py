@@ -79,14 +79,14 @@ class FeedbackConfig(Section, frozen=True):
     """The light and the speaker."""
 
     light: Literal["simulated", "gpio", "usb"] = "simulated"
-    """simulated writes to the log"""
-    blink_hz: Annotated[float, Meta(gt=0, le=10)] = 2.0
+    """simulated writes to the log; `bikeped run` wants this key in the file"""
+    blink_hz: Annotated[float, Meta(ge=0.5, le=5)] = 2.0
     """blinking of ALERT's red, flashes per second"""
-    fault_blink_hz: Annotated[float, Meta(gt=0, le=10)] = 0.5
+    fault_blink_hz: Annotated[float, Meta(ge=0.25, le=5)] = 0.5
     """blinking of FAULT's orange, flashes per second"""
     hold_alert_s: Annotated[float, Meta(ge=0, le=10)] = 1.0
     """the light keeps ALERT at least this long, so that an alert of one frame is visible, s"""
-    recover_frames: Annotated[int, Meta(ge=1, le=300)] = 5
+    recover_frames: Annotated[int, Meta(ge=1, le=150)] = 5
     """good frames in a row before the light leaves FAULT"""
     gpio: GpioConfig = msgspec.field(default_factory=GpioConfig)
     usb: UsbConfig = msgspec.field(default_factory=UsbConfig)
@@ -99,7 +99,7 @@ class MqttConfig(Section, frozen=True):
     enabled: bool = False
     """publish to the broker"""
     host: Annotated[str, Meta(min_length=1)] = "localhost"
-    """broker's name or address"""
+    """broker's name or address, without http:// and without the port"""
     port: Annotated[int, Meta(ge=1, le=65535)] = 1883
     """broker's port"""
     site: Annotated[str, Meta(pattern="^[^/+#\\x00]+$", max_length=64)] = "crossing"

@@ -18,6 +18,7 @@ import msgspec
 from bikeped import __version__
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig
+from bikeped.files import read_regular
 from bikeped.models import model_file
 
 #: What turns detections into a state on the pole; the simulation runs the same rule and tracker.
@@ -139,7 +140,7 @@ def check_provenance(loaded: LoadedConfig) -> ProvenanceCheck:
     """Compares the configuration in force with its provenance. Never raises: it is for a log."""
     path = provenance_path(Path(loaded.source))
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=Provenance)
+        found = msgspec.json.decode(read_regular(path), type=Provenance)
     except FileNotFoundError:
         return ProvenanceCheck(
             False, f"decision: no provenance ({path.name} is not there): it was never promoted"

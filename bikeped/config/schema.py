@@ -37,7 +37,8 @@ class CameraConfig(Section, frozen=True):
     """The camera: its source, its lens, and its pose above the ground."""
 
     source: Annotated[str, Meta(min_length=1)] = "/dev/video0"
-    """V4L2 device, video file, folder of images, or rtsp:// or http:// address"""
+    """V4L2 device, video file, folder of images, or rtsp:// or http:// address; `bikeped run` wants
+    this key in the file"""
     width: Annotated[int, Meta(ge=16, le=16384)] = 3840
     """sensor width requested from the camera, pixels"""
     height: Annotated[int, Meta(ge=16, le=16384)] = 2160
@@ -84,9 +85,9 @@ class CameraConfig(Section, frozen=True):
     file; by it the service notices that the camera has moved; null: by the first 2 s of pictures"""
     table_step_px: Annotated[int, Meta(ge=2, le=64)] = 8
     """spacing of the ground table's lattice, crop pixels"""
-    stale_after_s: Annotated[float, Meta(gt=0, le=60)] = 0.5
+    stale_after_s: Annotated[float, Meta(ge=0.05, le=2)] = 0.5
     """no frame for this long is a FAULT and a new capture, seconds"""
-    hang_after_s: Annotated[float, Meta(ge=1, le=600)] = 15.0
+    hang_after_s: Annotated[float, Meta(ge=1, le=60)] = 15.0
     """a read that has not returned for this long ends the process, and systemd starts it again,
     seconds"""
 
@@ -99,7 +100,9 @@ class DetectionConfig(Section, frozen=True):
     bikeped, trained on drawn streets only, for demo and self-test, never for a street; null:
     none"""
     sha256: Annotated[str, Meta(pattern="^[0-9a-fA-F]{64}$")] | None = None
-    """SHA-256 of the model file, refused when different; null: any"""
+    """SHA-256 of the model, refused when different; of an ONNX file with weights in files beside it
+    it covers those, too; `conformance promote` sets it; null: any (the bundled model is always
+    checked)"""
     layout: Literal["auto", "yolov5", "yolov8", "end2end", "yolox", "yolox-decoded"] = "auto"
     """output layout: yolov5 also v7; yolov8 also v9, v11, v12; end2end also v10 and 26; auto tells
     them apart by metadata and shapes"""
@@ -110,7 +113,7 @@ class DetectionConfig(Section, frozen=True):
     """part of the frame that the model gets; road: where road users within decision.max_range_m can
     be, by height and pitch of the camera; frame: all; auto: road where the model's input can have
     that height, which is faster, else frame"""
-    confidence: Annotated[float, Meta(ge=0.001, le=1)] = 0.1
+    confidence: Annotated[float, Meta(ge=0.001, le=0.95)] = 0.1
     """lowest confidence of a detection that is kept"""
     iou: Annotated[float, Meta(ge=0.01, le=1)] = 0.45
     """overlap above which the less confident of two boxes of one class is dropped"""
@@ -139,7 +142,7 @@ class DetectionConfig(Section, frozen=True):
     threads: Annotated[int, Meta(ge=0, le=256)] = 0
     """CPU threads for inference; 0 lets the runtime choose, and runs two copies of the model with
     half of the cores each on a recording"""
-    silent_after_s: Annotated[float, Meta(gt=0, le=60)] = 0.5
+    silent_after_s: Annotated[float, Meta(ge=0.05, le=2)] = 0.5
     """no detector answer for this long is a FAULT, seconds"""
 
 
@@ -148,7 +151,7 @@ class TrackingConfig(Section, frozen=True):
 
     match_radius_m: Annotated[float, Meta(gt=0, le=50)] = 3.0
     """largest distance between a detection and the track that it is matched with, m"""
-    max_unseen_s: Annotated[float, Meta(ge=0, le=60)] = 10.0
+    max_unseen_s: Annotated[float, Meta(ge=0, le=30)] = 10.0
     """an unseen track coasts at constant velocity this long, s"""
     velocity_weight: Annotated[float, Meta(gt=0, le=1)] = 0.15
     """weight of the newest step in the smoothed velocity, per nominal frame; the paper's simulation
@@ -185,7 +188,8 @@ class DecisionConfig(Section, frozen=True):
     rule: Literal["pairwise", "naive", "ttc", "distance"] = "pairwise"
     """closing check: the paper's pairwise one, or a baseline"""
     memory_frames: Annotated[int, Meta(ge=0, le=3000)] = 58
-    """N: a cyclist is remembered this many nominal frames"""
+    """N: a cyclist is remembered this many nominal frames; 0, the paper's rule without memory, is
+    for conformance only: `bikeped run` refuses it"""
     d_min_m: Annotated[float, Meta(ge=0, le=100)] = 1.9
     """nearest pair distance that can alert, m"""
     d_max_m: Annotated[float, Meta(gt=0, le=100)] = 24.8
@@ -217,7 +221,7 @@ class LatencyConfig(Section, frozen=True):
     """nominal frames to predict ahead, with compensation: frames"""
     order: Literal[1, 2] = 1
     """1 predicts with velocity, 2 also with acceleration (worse, says the paper)"""
-    max_s: Annotated[float, Meta(ge=0, le=5)] = 0.5
+    max_s: Annotated[float, Meta(ge=0, le=2)] = 0.5
     """never predict farther ahead than this, seconds"""
     camera_offset_s: Annotated[float, Meta(ge=0, le=2)] = 0.0
     """part of the camera's delay that its time stamp does not show, seconds"""
@@ -243,6 +247,8 @@ class Config(Section, frozen=True):
     web: WebConfig = msgspec.field(default_factory=WebConfig)
     audit: AuditConfig = msgspec.field(default_factory=AuditConfig)
     latency: LatencyConfig = msgspec.field(default_factory=LatencyConfig)
+    complete: bool = False
+    """true, as the last key: the file is whole; a file that was cut off lacks it"""
 
 
 def sections(

@@ -9,8 +9,8 @@ from typing import Any
 import yaml
 
 from bikeped.errors import ConfigError
+from bikeped.files import read_regular
 
-_MAX_BYTES = 1_000_000
 _MAX_NODES = 20_000
 _MAX_DEPTH = 20
 #: Halves of surrogate pairs, which no UTF-8 text holds, and NUL, which no path holds.
@@ -92,9 +92,7 @@ def load_sections(text: str, source: str) -> dict[str, Any]:
 def read_text(path: Path, remedy: str) -> str:
     """The text of a YAML file, line ends as they are; ConfigError says what to do (`remedy`)."""
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{path}: larger than 1 MB; a configuration is a short text")
-        return path.read_bytes().decode("utf-8")
+        return read_regular(path).decode("utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
     except UnicodeDecodeError as error:

@@ -40,6 +40,9 @@ def check_together(config: Config, source: str) -> None:
         problem += "camera.radius_px and camera.fov_deg"
     elif (mqtt.cert_file is None) != (mqtt.key_file is None):
         problem = "mqtt.cert_file and mqtt.key_file: one without the other; set both"
+    elif re.search(r"[\s/@?#]", mqtt.host) or re.fullmatch(r"[^:]*:\d+", mqtt.host):
+        problem = f"mqtt.host: {one_line(mqtt.host)} is no host; give its name or address alone, "
+        problem += "e.g. broker.lan, and the port as mqtt.port"
     elif web.enabled and web.token_file is None and not is_loopback(web.host):
         problem = f"web.host: {one_line(web.host)} can be reached by others, who would see the "
         problem += "camera's picture; set web.token_file too, or web.host: 127.0.0.1"

@@ -19,6 +19,7 @@ import msgspec
 from bikeped.config.output_sections import FeedbackConfig
 from bikeped.errors import BikepedError, ConfigError
 from bikeped.feedback import open_light
+from bikeped.files import read_regular
 
 
 class _FeedbackOnly(msgspec.Struct):
@@ -33,7 +34,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("usage: python -m bikeped.feedback CONFIG\n")
         return 2
     try:
-        data = Path(arguments[0]).read_bytes()
+        data = read_regular(Path(arguments[0]))
         open_light(msgspec.yaml.decode(data, type=_FeedbackOnly).feedback).close()
     except BikepedError as error:
         sys.stderr.write(f"{error}\n")

@@ -153,7 +153,9 @@ def test_a_missing_camera_is_a_fault_and_not_the_end(start, small_config):
     [
         (["detection.model=/nowhere/model.onnx"], r"/nowhere/model\.onnx"),
         (["detection.model=null"], r"small\.yaml.*detection\.model"),
-        (["feedback.light=gpio"], r"feedback\.gpio: no red lamp"),
+        (["feedback.light=gpio"], r"feedback\.gpio\.chip: missing"),
+        (["feedback.light=gpio", "feedback.gpio.chip=x"], r"feedback\.gpio: no red lamp"),
+        (["decision.memory_frames=0"], r"decision\.memory_frames: 0"),
         (["camera.pad_size=100", "camera.crop_size=200"], r"camera\.crop_size"),
         (["mqtt.enabled=true", "mqtt.password_file=/nowhere/pw"], r"mqtt\.password_file"),
         (
@@ -250,7 +252,7 @@ def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp
         more="  enabled: true\n  host: 127.0.0.1\n  port: 9\n"
         "web: {enabled: true, port: 0}\n"
         "audit: {path: audit.jsonl, min_free_mb: 1000000}\n"
-        "feedback: {light: usb, sound: {enabled: true, device: none-such}}\n",
+        "feedback: {light: usb, usb: {device: relay}, sound: {enabled: true, device: none}}\n",
     )
     service = start(config)
     service.until_told("READY=1")

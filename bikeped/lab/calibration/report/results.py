@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bikeped import __version__
+from bikeped.config.lens_check import checksum
 from bikeped.errors import CalibrationError, GeometryError
 from bikeped.files import write_whole
 from bikeped.geometry.framing import Framing
@@ -143,7 +144,7 @@ def calibration_data(
         ) from error
     observations = fit.observations
     unit = float(PROJECTIONS[fit.model.projection].radius(np.asarray(half)))
-    return {
+    values = {
         "model": fit.model.projection,
         "cx": fit.cx,
         "cy": fit.cy,
@@ -171,6 +172,7 @@ def calibration_data(
         "software_version": __version__,
         "pictures_hash": prepared.images_hash,
     }
+    return {**values, "checksum": checksum(values), "complete": True}
 
 
 def finite_or_null(uncertainty: dict[str, float]) -> dict[str, float | None]:
