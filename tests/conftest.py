@@ -5,24 +5,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import shutil
 import socket
 import struct
-import subprocess
-import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
-import numpy as np
-import onnx
 import pytest
-import simplejpeg
 from hypothesis import settings
-from onnx import TensorProto, helper, numpy_helper
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
-
-from bikeped.lab.rendering.clip import AviWriter
+from small_crossing import (
+    DEADLINE_S,
+    MOSQUITTO,
+    Broker,
+    small_pictures,
+    write_clip,
+    write_config,
+    write_model,
+)
 
 #: `serve`, `open_page` and a headless Chromium, for the pages of device and lab.
 pytest_plugins = ["browser_fixtures"]
@@ -30,48 +30,6 @@ pytest_plugins = ["browser_fixtures"]
 # No test judges time: a busy machine is slow.
 settings.register_profile("bikeped", deadline=None)
 settings.load_profile("bikeped")
-
-MOSQUITTO = shutil.which("mosquitto", path="/usr/local/sbin:/usr/sbin:/usr/local/bin:/usr/bin")
-DEADLINE_S = 30.0  # generous: reached only by a failure
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-class Broker:
-    """One mosquitto process on one port; can be killed and started again."""
-
-    def __init__(self, directory: Path, lines: tuple[str, ...] = ("allow_anonymous true",)) -> None:
-        assert MOSQUITTO is not None
-        self.directory = directory
-        self.port = free_port()
-        # Started as root it would otherwise become a user who cannot read the test's files.
-        options = ("user root", "persistence false", f"listener {self.port} 127.0.0.1", *lines)
-        self.config = directory / "mosquitto.conf"
-        self.config.write_text("\n".join(options) + "\n")
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        with (self.directory / "mosquitto.log").open("ab") as output:
-            self.process = subprocess.Popen(
-                [str(MOSQUITTO), "-c", str(self.config)], stdout=output, stderr=output
-            )
-        deadline = time.monotonic() + DEADLINE_S
-        while True:
-            with contextlib.suppress(OSError):
-                socket.create_connection(("127.0.0.1", self.port), 1).close()
-                return
-            if self.process.poll() is not None or time.monotonic() > deadline:
-                pytest.fail((self.directory / "mosquitto.log").read_text())
-
-    def kill(self) -> None:
-        if self.process is not None:
-            self.process.kill()
-            self.process.wait()
-            self.process = None
 
 
 @pytest.fixture(scope="session")
@@ -240,34 +198,11 @@ def listen() -> Callable[..., contextlib.AbstractAsyncContextManager[Listener]]:
 
 # --- a small crossing: camera, clip and model that every service and command-line test can afford
 
-SMALL_CONFIG = """
-camera:
-  source: {source}
-  width: 96
-  height: 64
-  projection: perspective
-  pad_size: null
-  crop_size: null
-  radius_px: 58
-  fov_deg: 73
-  height_m: 5.0
-  pitch_deg: -35
-monitor: {{picture: false}}
-detection: {{model: {model}, providers: [cpu], threads: 1, rider_overlap: 1.0}}
-mqtt:
-  health_interval_s: 0.2
-"""
-
 
 @pytest.fixture(scope="session")
 def small_jpegs() -> list[bytes]:
     """Eight pictures of 96 x 64 that differ."""
-    v, u = np.mgrid[0:64, 0:96]
-    pictures = []
-    for n in range(8):
-        rgb = np.stack([u * 2, v * 3, (u + v + 20 * n) % 200], axis=2).astype(np.uint8)
-        pictures.append(simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), colorspace="RGB"))
-    return pictures
+    return small_pictures()
 
 
 @pytest.fixture
@@ -275,12 +210,7 @@ def make_clip(tmp_path: Path, small_jpegs: list[bytes]) -> Callable[..., Path]:
     """Writes a Motion JPEG AVI; `pictures` are used in turn."""
 
     def make(name: str, frames: int, pictures: list[bytes] | None = None, fps: int = 30) -> Path:
-        turn = pictures or small_jpegs
-        path = tmp_path / name
-        with AviWriter(path, fps, (96, 64)) as clip:
-            for number in range(frames):
-                clip.write(turn[number % len(turn)])
-        return path
+        return write_clip(tmp_path / name, frames, pictures or small_jpegs, fps)
 
     return make
 
@@ -288,26 +218,7 @@ def make_clip(tmp_path: Path, small_jpegs: list[bytes]) -> Callable[..., Path]:
 @pytest.fixture(scope="session")
 def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A real ONNX model that sees one pedestrian, 7 m ahead, in every picture."""
-    anchors = 12 * 8 + 6 * 4 + 3 * 2  # of strides 8, 16 and 32 on 96 x 64
-    answer = np.zeros((1, 4 + 2, anchors), np.float32)
-    answer[0, :, 5] = (48, 22, 10, 26, 0.9, 0.0)  # cx cy w h, person, bicycle
-    graph = helper.make_graph(
-        [helper.make_node("Identity", ["answer"], ["output0"])],
-        "one pedestrian",
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 64, 96))],
-        [helper.make_tensor_value_info("output0", TensorProto.FLOAT, answer.shape)],
-        [numpy_helper.from_array(answer, "answer")],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    for key, value in {
-        "names": "{0: 'person', 1: 'bicycle'}",
-        "task": "detect",
-        "imgsz": "[64, 96]",
-    }.items():
-        model.metadata_props.add(key=key, value=value)
-    path = tmp_path_factory.mktemp("model") / "pedestrian.onnx"
-    onnx.save(model, path)
-    return path
+    return write_model(tmp_path_factory.mktemp("model") / "pedestrian.onnx")
 
 
 @pytest.fixture
@@ -315,11 +226,6 @@ def small_config(tmp_path: Path, small_model: Path) -> Callable[..., Path]:
     """Writes a configuration for the small camera; keywords are more lines of YAML."""
 
     def make(source: Path | str = "/dev/video-none", more: str = "", model: object = None) -> Path:
-        path = tmp_path / "small.yaml"
-        text = SMALL_CONFIG.format(source=source, model=model or small_model)
-        if "feedback:" not in more:
-            more += "feedback: {light: simulated}\n"
-        path.write_text(text + more, encoding="utf-8")
-        return path
+        return write_config(tmp_path / "small.yaml", source, str(model or small_model), more)
 
     return make

@@ -3,98 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import signal
-import socket
-import subprocess
-import sys
-import threading
 import time
 import urllib.error
 import urllib.request
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jsonschema
 import pytest
+from small_crossing import PATIENCE_S, Service
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
-PATIENCE_S = 40.0
-
-
-class Service:
-    """A `bikeped run` process, its log as it comes, and what it tells the service manager."""
-
-    def __init__(self, config: Path, *options: str, program: str | None = None) -> None:
-        name = f"@bikeped-test-{uuid.uuid4().hex}"
-        self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.manager.bind("\0" + name[1:])
-        self.manager.settimeout(PATIENCE_S)
-        start = (
-            [sys.executable, "-c", program]
-            if program
-            else [sys.executable, "-m", "bikeped.cli.main"]
-        )
-        self.process = subprocess.Popen(
-            [*start, "run", "-c", str(config), *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env={**os.environ, "NOTIFY_SOCKET": name},
-        )
-        self.lines: list[str] = []
-        self._news = threading.Condition()
-        self._ended = False
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            with self._news:
-                self.lines.append(line.rstrip())
-                self._news.notify()
-        with self._news:
-            self._ended = True
-            self._news.notify()
-
-    @property
-    def log(self) -> str:
-        return "\n".join(self.lines)
-
-    def until_said(self, pattern: str) -> re.Match[str]:
-        def found() -> re.Match[str] | None:
-            return re.search(pattern, self.log)
-
-        with self._news:
-            self._news.wait_for(lambda: found() or self._ended, PATIENCE_S)
-        match = found()
-        assert match, f"{pattern!r} was not said:\n{self.log}"
-        return match
-
-    def until_told(self, message: str) -> None:
-        while message not in self.manager.recv(4096).decode().split("\n"):
-            pass
-
-    def stop(self, number: int = signal.SIGTERM) -> int:
-        self.process.send_signal(number)
-        return self.wait()
-
-    def wait(self) -> int:
-        status = self.process.wait(PATIENCE_S)
-        self._reader.join(PATIENCE_S)
-        return status
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        self._reader.join(PATIENCE_S)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-        self.manager.close()
 
 
 @pytest.fixture
