@@ -1,0 +1,52 @@
+"""The fault campaign: injects faults against the real service and writes docs/faults.md.
+
+`scripts/faults` runs all rows, `scripts/faults 1 9 13` some; the page is written when all ran. Ends
+with 1 when a row fails that this campaign is to pass.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+
+def main() -> int:
+    runner = importlib.import_module("campaign.runner")
+
+    os.chdir(ROOT)
+    known = runner.load_rows()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("numbers", nargs="*", type=int, metavar="N", help="rows; all without")
+    parser.add_argument("--repeat", type=int, metavar="K", help="repetitions of each row")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--page", type=Path, help="write the page here, whatever ran")
+    arguments = parser.parse_args()
+    unknown = [number for number in arguments.numbers if number not in known]
+    if unknown:
+        parser.error(f"no row {unknown[0]}; rows are 1 to {max(known)}")
+    console = Console()
+    rows = [known[number] for number in arguments.numbers or known]
+    results = runner.run(rows, arguments.repeat, console)
+    console.print(runner.table(results))
+    if arguments.json:
+        text = json.dumps(runner.figures(results), indent=2)
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+    if arguments.page or not arguments.numbers:
+        runner.write_page(results, arguments.page or ROOT / "docs" / "faults.md")
+    failed = runner.failed(results)
+    if failed:
+        console.print(f"failed: {', '.join(map(str, failed))}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,101 @@
+"""Faults that only a driver or a library can have, put in at the lowest seam inside the service.
+
+Each is switched by the campaign through the text of the file CAMPAIGN_CONTROL, read at every call.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bikeped.capture.cameras import NetworkSource
+from bikeped.detection.detector import DetectionResult, Detector
+from bikeped.errors import DetectorError
+from bikeped.types import Detections, Frame, ImageArray
+
+
+def control() -> tuple[str, float]:
+    """What is asked for now, and its number: `stall 0.7` is ("stall", 0.7)."""
+    try:
+        word, _, number = Path(os.environ["CAMPAIGN_CONTROL"]).read_text().partition(" ")
+    except OSError:
+        return "", 0.0
+    return word, float(number or 0)
+
+
+def camera() -> None:
+    """The camera's driver: `hang`, `stale` buffers, stamps `future` or `shuffled`."""
+    read = NetworkSource.read
+    last: dict[int, Frame] = {}
+
+    def faulty(source: NetworkSource) -> Frame:
+        word, number = control()
+        if word == "hang":
+            threading.Event().wait()  # for ever, as a driver may
+        frame = read(source)
+        if word == "stale":
+            return last.setdefault(id(source), frame)
+        last[id(source)] = frame
+        if word == "future" and frame.number % 50 == 0:
+            return dataclasses.replace(frame, captured_s=frame.captured_s + number)
+        if word == "shuffled":
+            shift_s = (0.0, -0.08, 0.0, -0.02)[frame.number % 4]
+            return dataclasses.replace(frame, captured_s=frame.captured_s + shift_s)
+        return frame
+
+    NetworkSource.read = faulty  # type: ignore[method-assign]
+
+
+def detector() -> None:
+    """The detector: `raise`, `memory`, `stall` for seconds, `empty` answers, `crowd` of so many."""
+    infer = Detector.infer
+
+    def faulty(self: Detector, rgb: ImageArray, width: int, height: int) -> DetectionResult:
+        word, number = control()
+        if word == "raise":
+            raise DetectorError("campaign: the runtime failed")
+        if word == "memory":
+            raise MemoryError("campaign: out of memory")
+        if word == "stall":
+            time.sleep(number)
+        if word == "kill":
+            os._exit(70)
+        result = infer(self, rgb, width, height)
+        if word == "empty":
+            return dataclasses.replace(result, detections=Detections.empty())
+        if word == "crowd":
+            return dataclasses.replace(result, detections=crowd(int(number), width, height))
+        return result
+
+    Detector.infer = faulty  # type: ignore[method-assign]
+
+
+def interpreter() -> None:
+    """`hold`: C code that keeps the interpreter's lock for so many seconds, once."""
+
+    def watch() -> None:
+        while True:
+            time.sleep(0.02)
+            word, number = control()
+            if word == "hold":
+                Path(os.environ["CAMPAIGN_CONTROL"]).unlink()
+                import ctypes
+
+                ctypes.PyDLL(None).usleep(int(number * 1e6))
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def crowd(number: int, width: int, height: int) -> Detections:
+    """So many people and cyclists, spread over the ground in the picture."""
+    rng = np.random.default_rng(number)
+    centre = rng.uniform((0, 0.3 * height), (width, height), (number, 2))
+    box = np.hstack([centre, centre]).astype(np.float32) + np.array([-3, -10, 3, 0], np.float32)
+    return Detections(
+        rng.integers(0, 2, number).astype(np.int8), np.full(number, 0.9, np.float32), box
+    )
