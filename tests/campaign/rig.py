@@ -91,7 +91,9 @@ class Rig:
 
     def config(self, more: str = WEB, source: str | None = None, name: str = "pole.yaml") -> Path:
         """A configuration of the small camera; `source` None is the loopback camera."""
-        return write_config(self.folder / name, source or self.camera.address, self.model, more)
+        return write_config(
+            self.folder / name, source or self.camera.address, self.model, more, picture=True
+        )
 
     def control(self, text: str = "") -> float:
         """Tells the seam inside the service what to do; returns the time."""

@@ -21,7 +21,7 @@ PAGE_HEAD = """# The fault campaign
 
 Every fault of this list is injected against the real service: `bikeped run` as a process, a
 loopback camera (Motion JPEG over HTTP), a real mosquitto, and a light that keeps its colour when
-its process dies, as a relay does. The light's changes are read from outside. This page is written by
+its process dies, as a relay does. Its changes are read from outside. This page is written by
 
 ```sh
 scripts/faults            # all; `scripts/faults 1 9 13 --repeat 3` some; `--json FILE` the figures
