@@ -11,11 +11,13 @@ from prometheus_client import CollectorRegistry
 
 from bikeped.config.load import LoadedConfig, parse_config
 from bikeped.faults import Fault
+from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.verdicts import Verdict
 from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.detection_scheduler import DecodedFrame
 from bikeped.pipeline.loop import FrameResult
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.telemetry.builders import rfc3339
+from bikeped.telemetry.builders import check_status, drift_status, rfc3339
 from bikeped.telemetry.mqtt import MqttStatus
 from bikeped.telemetry.schema import (
     CameraHealth,
@@ -80,6 +82,9 @@ def health(**changes: Any) -> HealthMessage:
         "fps": 29.9,
         "latency_ms": {"total": StageLatency(p50=12.0, p95=20.0, p99=30.0, max=44.0)},
         "camera": CameraHealth(ok=True, detail="frames arrive", capture_age_ms=23.0),
+        "picture": ComponentStatus(ok=False, detail="picture: The picture is blurred."),
+        "checks": [check_status(Verdict("picture.blurred", 1.5, 1.0, 2.5, True, "blurred"))],
+        "drift": drift_status(Drift(pixels=4.5, degrees=0.3, metres_at_10m=0.16, since_start=True)),
         "detector": ComponentStatus(ok=True, detail="answers"),
         "light": ComponentStatus(ok=True, detail="simulated"),
         "faults": [],

@@ -302,6 +302,8 @@ function showStatus({ health, mqtt }) {
   const lost = health.counters;
   const rows = [
     ["Camera", ...part(health.camera)],
+    ["Picture", ...part(health.picture)],
+    ["Camera moved", driftWords(health.drift)],
     ["Detector", ...part(health.detector)],
     ["Light", ...part(health.light)],
     ["MQTT", ...brokerWords(mqtt)],
@@ -315,10 +317,24 @@ function showStatus({ health, mqtt }) {
     ["Version", health.version],
   ];
   facts($("#health"), rows);
+  showChecks(health.checks);
   for (const [stage, row] of latencyRows) {
     const figures = health.latency_ms[stage];
     ["p50", "p95", "max"].forEach((name, i) => setText(row.children[2 + i], figures ? fixed(figures[name], figures[name] < 10 ? 2 : 0) : "–"));
   }
+}
+
+function driftWords(drift) {
+  if (drift === null || drift.metres_at_10m === null) return "not measured yet";
+  return `${fixed(drift.metres_at_10m, 2)} m at 10 m, ${fixed(drift.degrees, 1)}°, ${fixed(drift.pixels, 1)} px since ${drift.since_start ? "the start" : "it was aligned"}`;
+}
+
+function showChecks(checks) {
+  $("#checks").hidden = checks.length === 0;
+  const number = (value) => el("td", { class: "number" }, value === null ? "–" : fixed(value, 2));
+  $("#checks-rows").replaceChildren(...checks.map((check) => el("tr", {},
+    el("th", { scope: "row", class: check.active ? "bad-mark" : "ok-mark" }, check.code.replace("picture.", "").replace("_", " ")),
+    number(check.value), number(check.threshold), el("td", { class: "number" }, seconds(check.hold_s)))));
 }
 
 function brokerWords(mqtt) {
