@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -26,6 +25,7 @@ from bikeped.cli.guard import check_outputs, guarded
 from bikeped.config.load import load_config
 from bikeped.config.runnable import check_runnable, warnings
 from bikeped.files import make_folder
+from bikeped.log_queue import log_through_queue
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,6 +43,7 @@ def run(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
 
     root = logging.getLogger()
     root.setLevel(min(root.level, logging.INFO))
+    log_through_queue()
     loaded = load_config(config_path, overrides)
     check_runnable(loaded)
     for text in warnings(loaded):
@@ -56,7 +57,6 @@ def run(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
     # Everything is stopped and the light is dark. A thread that hangs in a driver must not keep the
     # process alive: exit without joining it.
     logging.shutdown()
-    sys.stdout.flush()
     os._exit(status)
 
 
@@ -90,6 +90,7 @@ def replay(
     """Run VIDEO (a file or a folder of pictures) through the loop; print its decisions."""
     from bikeped.pipeline.replay import replay as replay_video
 
+    log_through_queue()
     if web_place is not None:
         overrides += web_overrides(web_place)
     loaded = load_config(config_path, overrides)

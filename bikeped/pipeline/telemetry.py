@@ -15,6 +15,7 @@ from bikeped.config.load import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
 from bikeped.feedback.light import LightDriver
+from bikeped.log_queue import dropped_lines
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.runtime import RateLimitedLogger
 from bikeped.pipeline.track_and_decide import TrackAndDecide
@@ -181,6 +182,7 @@ class Telemetry:
             alerts=self._alerts.count,
             mqtt_dropped=self._mqtt.status.dropped if self._mqtt else 0,
             audit_dropped=self._audit.dropped if self._audit else 0,
+            log_dropped=dropped_lines(),
         )
 
     def publish_health(self, message: HealthMessage) -> None:

@@ -34,6 +34,7 @@ _TOTALS = {
     "alerts": ("alerts", "Changes into ALERT"),
     "mqtt_dropped": ("mqtt_dropped", "MQTT messages dropped"),
     "audit_dropped": ("audit_dropped", "Audit log lines not written"),
+    "log_dropped": ("log_dropped", "Log lines lost because standard error took none"),
 }
 
 

@@ -116,6 +116,7 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True):
     alerts: Annotated[Count, Meta(description="changes into ALERT")]
     mqtt_dropped: Annotated[Count, Meta(description="messages dropped before reaching the broker")]
     audit_dropped: Annotated[Count, Meta(description="event lines not written to the audit log")]
+    log_dropped: Annotated[Count, Meta(description="log lines lost: standard error took none")] = 0
 
 
 class CheckStatus(msgspec.Struct, frozen=True, kw_only=True):

@@ -93,6 +93,7 @@ def test_gauges():
         ("alerts", "alerts_total"),
         ("mqtt_dropped", "mqtt_dropped_total"),
         ("audit_dropped", "audit_dropped_total"),
+        ("log_dropped", "log_dropped_total"),
         ("light_errors", "light_faults_total"),
     ],
 )

@@ -310,7 +310,7 @@ function showStatus({ health, mqtt }) {
     ["Frame rate", `${fixed(health.fps, 1)} frames/s`],
     ["Newest frame", health.camera.capture_age_ms === null ? "none yet" : `${millis(health.camera.capture_age_ms)} old`],
     ["Since start", `${duration(health.uptime_s)}, ${count(lost.frames, "frame")}, ${count(lost.alerts, "alert")}`],
-    ["Lost", `${lost.dropped} replaced, ${lost.undecodable} undecodable, ${lost.failed} failed, ${lost.out_of_order} out of order, ${lost.mqtt_dropped} messages, ${lost.audit_dropped} log lines`],
+    ["Lost", `${lost.dropped} replaced, ${lost.undecodable} undecodable, ${lost.failed} failed, ${lost.out_of_order} out of order, ${lost.mqtt_dropped} messages, ${lost.audit_dropped} audit lines, ${lost.log_dropped} log lines`],
     ["Camera source", hello?.source ?? "–"],
     ["Model", hello?.detector ?? "–"],
     ["Rule", hello ? `${hello.rule}, configuration ${hello.config_hash.slice(0, 12)}` : "–"],
