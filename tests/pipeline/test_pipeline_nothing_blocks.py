@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import free_port
+from small_crossing import free_port
 
 PATIENCE_S = 60.0
 
