@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 
 import click
 import cv2
 import msgspec
+import numpy as np
 from rich.markup import escape
 
 from bikeped.capture import open_source
@@ -28,6 +30,9 @@ from bikeped.files import write_whole
 from bikeped.geometry.alignment import PARAMETER_NAMES, AlignmentFit
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
+from bikeped.pipeline.application import load_detector_pool
+from bikeped.pipeline.check_picture import known_answers, write_check_picture
+from bikeped.pipeline.detection_scheduler import DetectionStage
 from bikeped.types import Frame
 from bikeped.web.align import add_align, frame_rgb
 from bikeped.web.align_grid import draw_grid, ground_grid
@@ -62,6 +67,13 @@ from bikeped.web.server import serve_pages
     type=click.Path(path_type=Path, dir_okay=False),
     help="Draw the ground grid over FRAME into this .png or .jpg, without a browser.",
 )
+@click.option(
+    "--check-picture",
+    "check_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Save FRAME (.jpg) with the road users that the model finds in it, without a browser, to "
+    "check the model with (detection.check_picture). It shows whoever is in FRAME.",
+)
 @json_option
 @guarded
 def command(
@@ -74,12 +86,13 @@ def command(
     points_path: Path | None,
     write: bool,
     grid_path: Path | None,
+    check_path: Path | None,
     json_path: str | None,
 ) -> int:
     """Fit the camera's height, pitch and lens to marks on the street in FRAME (picture or video).
 
-    Serves the align page, with the ground grid over FRAME, until Ctrl-C. With --points or --grid it
-    needs no browser, and ends with 1 when the marks do not agree with one another.
+    Serves the align page, with the ground grid over FRAME, until Ctrl-C. With --points, --grid or
+    --check-picture it needs no browser; it ends with 1 when the marks do not agree.
     """
     loaded = load_config(config_path, overrides)
     frame = _read_frame(picture, loaded, at_s)
@@ -87,7 +100,15 @@ def command(
         raise BikepedError("--points: missing; --save and --json need a fit of marks")
     if grid_path is not None and grid_path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise BikepedError(f"--grid {grid_path}: cannot be drawn; name a .png or .jpg file")
+    if check_path is not None and check_path.suffix.lower() not in (".jpg", ".jpeg"):
+        raise BikepedError(f"--check-picture {check_path}: name a .jpg file")
     frame_framing = framing(loaded).for_frame(frame.width, frame.height)
+    if check_path is not None:
+        count = _save_check_picture(loaded, frame, check_path)
+        if json_path != "-":
+            click.echo(f"wrote {check_path}, {count} road users; set detection.check_picture to it")
+        if points_path is None and grid_path is None:
+            return 0
     if points_path is None and grid_path is None:
         _serve(loaded, frame, picture, port, no_browser)
         return 0
@@ -124,6 +145,21 @@ def _read_frame(picture: Path, loaded: LoadedConfig, at_s: float) -> Frame:
             if frame.captured_s >= at_s - 1e-6:
                 return frame
     raise CaptureError(f"{picture}: ends before {at_s:g} s; choose a smaller --at")
+
+
+def _save_check_picture(loaded: LoadedConfig, frame: Frame, path: Path) -> int:
+    """Writes the frame and what the configured model finds in it; returns how many."""
+    pool = load_detector_pool(loaded)
+    decoded = DetectionStage(pool).decode(frame, 0.0, 0.0)
+    found = known_answers(pool.detect(decoded).detections, loaded.config.detection.confidence)
+    if not len(found):
+        raise BikepedError(
+            f"--check-picture {path}: the model finds nobody in FRAME with much confidence; take "
+            "one with a pedestrian and a cyclist near the pole"
+        )
+    box_px = found.box_px * np.float32(decoded.rgb.shape[1] / frame.width)
+    write_check_picture(path, decoded.rgb, replace(found, box_px=box_px), pool.model_hash)
+    return len(found)
 
 
 def _serve(loaded: LoadedConfig, frame: Frame, picture: Path, port: int, no_browser: bool) -> None:

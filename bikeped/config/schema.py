@@ -142,6 +142,10 @@ class DetectionConfig(Section, frozen=True):
     threads: Annotated[int, Meta(ge=0, le=256)] = 0
     """CPU threads for inference; 0 lets the runtime choose, and runs two copies of the model with
     half of the cores each on a recording"""
+    check_picture: str | None = None
+    """picture with known road users that goes through the model every 20 s, .jpg with its .json, as
+    bikeped align --check-picture writes them, relative to this file; null: a drawn one for the
+    bundled model, and else a frame with confident detections, which is remembered in memory only"""
     silent_after_s: Annotated[float, Meta(ge=0.05, le=2)] = 0.5
     """no detector answer for this long is a FAULT, seconds"""
 

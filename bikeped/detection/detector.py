@@ -144,6 +144,11 @@ class Detector:
         """The model file and what runs it."""
         return f"{Path(self._source).name} ({self._backend.description})"
 
+    @property
+    def region(self) -> Region | None:
+        """The part of every frame that the network gets; None: all of it."""
+        return self._preprocess.region
+
     def decode_size(self, frame_width: int, frame_height: int) -> tuple[int, int]:
         """Smallest decoded width and height that lose nothing against the full frame.
 

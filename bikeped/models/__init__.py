@@ -15,6 +15,8 @@ NOT_FOR_STREETS = (
 BUNDLED_FILE = Path(__file__).with_name("small.onnx")
 #: The same network quantised to eight bits, quicker on a processor.
 BUNDLED_INT8_FILE = Path(__file__).with_name("small-int8.onnx")
+#: A drawn picture in which the bundled model must find what check.json says.
+CHECK_PICTURE_FILE = Path(__file__).with_name("check.jpg")
 
 
 def model_file(model: str, base_dir: Path, *, on_cpu: bool = False) -> Path:

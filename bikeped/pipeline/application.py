@@ -28,6 +28,7 @@ from bikeped.pipeline.detection_scheduler import (
     DetectorPool,
     FrameDetector,
 )
+from bikeped.pipeline.detector_watch import DetectorWatch
 from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, Limits
 from bikeped.pipeline.feed import Feed
 from bikeped.pipeline.loop import FrameResultListener, Loop
@@ -145,6 +146,8 @@ class Application:
         watchers = () if pages is None else (pages,)
         logic = SignalLogic.from_config(loaded.config.feedback)
         self.dispatcher = SignalDispatcher(logic, light, speaker, (self.telemetry, *watchers))
+        watch = DetectorWatch(loaded, detector, track_and_decide.ground_mapper.camera, feed.live)
+        stack.push_async_callback(watch.close)
         self.loop = Loop(
             feed=feed,
             detection=DetectionStage(detector, view_width, picture_monitor(loaded)),
@@ -159,6 +162,7 @@ class Application:
                 lambda: light.fault,
                 lambda: None if loaded.config.monitor.picture else UNCHECKED,
             ),
+            watch=watch,
         )
         self._web_context = WebContext(
             loaded=loaded,

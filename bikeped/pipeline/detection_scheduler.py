@@ -30,6 +30,9 @@ _NEWEST_WEIGHT = 0.2  #: of the newest duration in the usual one
 
 #: Inferences at once on a recording, where the processor does them: see `load_detector_pool`.
 MAX_INFLIGHT = 2
+#: A check of the detector waits so long for a moment without a waiting frame, where an inference
+#: takes at most so long: a slower one would make the frame that then waits too old for the light.
+_CHECK_WAITS_S, _CHECK_DELAYS_S = 5.0, 0.12
 #: Decoded frames in use at once: being decoded, waiting, processed, drawn, a spare, and detected.
 FRAME_BUFFERS = 5 + MAX_INFLIGHT
 
@@ -60,6 +63,16 @@ class FrameDetector(Protocol):
         """What is in the frame; raises DetectorError. Called in up to `max_inflight` threads."""
 
 
+class DetectorChecker(Protocol):
+    """Says when known answers should go through the detector, and learns what came of it."""
+
+    def check_picture(self, waits_s: float) -> DecodedFrame | None:
+        """The picture to check with, where a check has been due for `waits_s` seconds."""
+
+    def checked(self, answer: DetectionResult | None) -> None:
+        """The detector's answer; None where it failed."""
+
+
 class DetectorPool:
     """A detector model, in as many copies as frames are detected at once."""
 
@@ -69,7 +82,7 @@ class DetectorPool:
         self.model_hash: str | None = first.model_hash
         self.cyclist_box_includes_rider = first.cyclist_box_includes_rider
         self.max_inflight = len(detectors)
-        self.decode_size = first.decode_size
+        self.decode_size, self.region = first.decode_size, first.region
         self._free: queue.SimpleQueue[Detector] = queue.SimpleQueue()
         for detector in detectors:
             self._free.put(detector)
@@ -172,6 +185,9 @@ class DetectionScheduler:
     One thread decodes, `max_inflight` threads detect. On a live feed a frame that fails, or does
     not fit the camera of `ground_mapper`, has the answer None and is reported to `monitor`; in a
     recording the error ends `detect_frames`, after the frames before it were passed on.
+
+    The pictures of `checker` are detected between frames: a frame that comes meanwhile waits for at
+    most one inference, and none is lost.
     """
 
     def __init__(
@@ -183,8 +199,9 @@ class DetectionScheduler:
         ground_mapper: GroundMapper,
         on_answer: Callable[[DecodedFrame, DetectionResult | None], Awaitable[None]],
         clock: Callable[[], float],
+        checker: DetectorChecker | None = None,
     ) -> None:
-        self._feed, self._detection = feed, detection
+        self._feed, self._detection, self._checker = feed, detection, checker
         self._monitor, self._counts = monitor, counts
         self._ground_mapper, self._on_answer, self._clock = ground_mapper, on_answer, clock
         self._slot = LatestFrameSlot()
@@ -192,6 +209,7 @@ class DetectionScheduler:
         self._idle = [WorkerThread("detect", clock) for _ in range(detection.max_inflight)]
         self.workers = (self._decoder, *self._idle)
         self._inflight = deque[_InFlight]()
+        self._check: _InFlight | None = None
         self._usual_detect_s = self._usual_decode_s = 0.0
         self._limited_log = RateLimitedLogger(log)
 
@@ -246,31 +264,64 @@ class DetectionScheduler:
                 self._dispatch()
                 full = asyncio.ensure_future(slot.full.wait())
                 news: set[asyncio.Future[Any]] = {inflight[0].answer} if inflight else set()
+                if self._check is not None:
+                    news.add(self._check.answer)
                 if self._idle and not slot.ended:
                     news.add(full)
                 try:
                     await asyncio.wait(news, return_when=asyncio.FIRST_COMPLETED)
                 finally:
                     full.cancel()
+                self._end_check()
                 if not (inflight and inflight[0].answer.done()):
                     continue
                 oldest = inflight.popleft()
                 self._idle.append(oldest.worker)
                 answer = self._result(oldest)
+                if not self._feed.live:  # at the same frame in every replay
+                    self._begin_check()
+                    if self._check is not None:
+                        await asyncio.wait({self._check.answer})
+                        self._end_check()
                 # The next frame is detected while this one is processed: detection takes longest.
                 self._dispatch()
                 await self._on_answer(oldest.decoded, answer)
         finally:
-            for frame in inflight:
+            for frame in (*inflight, *([self._check] if self._check else [])):
                 if not frame.answer.cancel() and not frame.answer.cancelled():
                     frame.answer.exception()  # retrieved, so that asyncio does not log it
 
     def _dispatch(self) -> None:
-        """Hands the waiting frame to an idle detector thread."""
+        """Hands the waiting frame to an idle detector thread; a check where none waits."""
+        if self._feed.live and not self._inflight:
+            waits = self._slot.full.is_set()
+            if not waits or self._usual_detect_s < _CHECK_DELAYS_S:
+                self._begin_check(_CHECK_WAITS_S if waits else 0.0)
         while self._idle and (decoded := self._slot.get_nowait()) is not None:
             worker, began_s = self._idle.pop(), time.perf_counter()
             answer = worker.submit(self._detect, decoded)
             self._inflight.append(_InFlight(decoded, worker, began_s, answer))
+
+    def _begin_check(self, waits_s: float = 0.0) -> None:
+        """Hands the check picture to an idle detector thread where a check is due."""
+        if self._checker is None or self._check is not None or not self._idle or self._slot.ended:
+            return
+        picture = self._checker.check_picture(waits_s)
+        if picture is not None:
+            worker = self._idle.pop()
+            answer = worker.submit(self._detection.detect, picture)
+            self._check = _InFlight(picture, worker, time.perf_counter(), answer)
+
+    def _end_check(self) -> None:
+        """Passes on what came of a check that has ended."""
+        if self._checker is None or self._check is None or not self._check.answer.done():
+            return
+        check, self._check = self._check, None
+        self._idle.append(check.worker)
+        error = check.answer.exception()
+        if error is not None:
+            self._limited_log.failure("check", error)
+        self._checker.checked(None if error is not None else check.answer.result())
 
     def _detect(self, decoded: DecodedFrame) -> DetectionResult:
         self._ground_mapper.framing_for(decoded.frame.width, decoded.frame.height)  # may raise

@@ -50,7 +50,7 @@ class _Failure:
 
 
 class FaultMonitor:
-    """Collects the faults of a pipeline; a recording has those of its pictures only.
+    """Collects the faults of a pipeline; a recording has those of its pictures and its detector.
 
     `sources` are asked for faults of other parts: a fault made there reaches light and health as
     the table in `bikeped.faults` says.
@@ -80,7 +80,7 @@ class FaultMonitor:
         """The faults that the light shows; empty when the decision holds."""
         checks = [f for f in self.picture.faults() if f.kind.effect is not Effect.NOTICE]
         if not self._feed.live:
-            return tuple(checks)
+            return (*checks, *self._from_sources(Effect.WITHHELD))
         error, limits = self._feed.error, self._limits
         faults: list[Fault | None] = [
             _age_fault("camera", "frame", self._feed.age_s(now_s), limits.stale_after_s),

@@ -31,6 +31,7 @@ from bikeped.pipeline.detection_scheduler import (
     DetectionStage,
     FrameCounts,
 )
+from bikeped.pipeline.detector_watch import DetectorWatch
 from bikeped.pipeline.fault_monitor import DEFAULT_LIMITS, FaultMonitor, Limits, StageHangError
 from bikeped.pipeline.feed import Feed
 from bikeped.pipeline.runtime import RateLimitedLogger
@@ -115,7 +116,8 @@ def frame_overlay(
 class Loop:
     """Moves frames from `feed` to the light. `clock` gives seconds on the frames' time base.
 
-    `fault_sources` are asked for faults of other parts (see `FaultMonitor`).
+    `fault_sources` are asked for faults of other parts (see `FaultMonitor`); `watch` sees whether
+    the detector is blind.
     """
 
     def __init__(
@@ -130,11 +132,13 @@ class Loop:
         clock: Callable[[], float] = time.monotonic,
         on_tick: Callable[[], None] = lambda: None,
         fault_sources: Sequence[Callable[[], Fault | None]] = (),
+        watch: DetectorWatch | None = None,
     ) -> None:
         self.feed, self._detection, self._track_and_decide = feed, detection, track_and_decide
         self._dispatcher, self._outputs = dispatcher, tuple(outputs)
         self._limits, self._clock, self._on_tick = limits, clock, on_tick
-        self.monitor = FaultMonitor(feed, limits, fault_sources)
+        sources = (*fault_sources, lambda: None if watch is None else watch.fault)
+        self.monitor, self.watch = FaultMonitor(feed, limits, sources), watch
         self.counts = FrameCounts()
         self._limited_log = RateLimitedLogger(log)
         self.stopping = asyncio.Event()  #: set it to end `run`
@@ -162,6 +166,7 @@ class Loop:
             self._track_and_decide.ground_mapper,
             self._process,
             self._clock,
+            self.watch,
         )
         detecting = asyncio.create_task(scheduler.detect_frames(), name="detect")
         stopping = asyncio.create_task(self.stopping.wait(), name="stop")
@@ -211,6 +216,8 @@ class Loop:
         tracking = self._track_and_decide.update(
             answer.detections, frame.width, frame.height, frame.captured_s, age_s
         )
+        if self.watch is not None:
+            await self.watch.on_answer(decoded, answer.detections)
         self.monitor.processed(frame.captured_s, decoded.checks)
         self.counts.frames += 1
         began = time.perf_counter()

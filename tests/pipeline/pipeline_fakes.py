@@ -14,6 +14,7 @@ from bikeped.detection.detector import DetectionResult
 from bikeped.faults import Fault, fault_texts
 from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.pipeline.detection_scheduler import DecodedFrame, DetectionStage
+from bikeped.pipeline.detector_watch import DetectorWatch
 from bikeped.pipeline.fault_monitor import Limits
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
@@ -189,6 +190,7 @@ class Rig:
         self.track_and_decide = TrackAndDecide(self.config)
         self.max_inflight = 1
         self.fault_sources: list[Callable[[], Fault | None]] = []
+        self.watch: DetectorWatch | None = None
 
     def start(self) -> None:
         self.dispatcher = SignalDispatcher(
@@ -208,6 +210,7 @@ class Rig:
             clock=self.clock,
             on_tick=self.recorder.tick,
             fault_sources=self.fault_sources,
+            watch=self.watch,
         )
         self.task = asyncio.create_task(self.loop.run())
 
