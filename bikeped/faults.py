@@ -67,8 +67,7 @@ _ends = partial(_stops, severity=Severity.CRITICAL, clears=Clears.RESTART, exit_
 #: The light shows FAULT in place of blue and green.
 _withholds = partial(_stops, effect=Effect.WITHHELD, clears=Clears.AT_ONCE)
 #: Reported, while the light goes on showing the decision.
-_notice = partial(FaultKind, effect=Effect.NOTICE, severity=Severity.ERROR, clears=Clears.AT_ONCE)
-_minor = partial(_notice, severity=Severity.WARNING)
+_minor = partial(FaultKind, effect=Effect.NOTICE, severity=Severity.WARNING, clears=Clears.AT_ONCE)
 
 FAULT_KINDS: dict[str, FaultKind] = {
     kind.code: kind
@@ -81,7 +80,9 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _stops(
             "camera.moved", "camera", "The camera has moved since it was aligned; align it again."
         ),
-        _ends("camera.hang", "camera", "A read has not returned for camera.hang_after_s."),
+        _ends(
+            "camera.hang", "camera", "A read does not return, and the camera cannot be opened anew."
+        ),
         _stops("picture.frozen", "picture", "The same pictures come again and again."),
         _stops("picture.black", "picture", "The picture is black."),
         _stops("picture.white", "picture", "The picture is white."),
@@ -96,8 +97,8 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _stops("detector.no_answer", "detector", "No answer for detection.silent_after_s."),
         _stops("detector.future_time", "detector", "The newest answer's time is in the future."),
         _stops("detector.error", "detector", "The detector fails on every frame."),
-        _ends("detector.hang", "detector", "Inference has not returned for camera.hang_after_s."),
-        _ends("detector.failing", "detector", "Only failures for camera.hang_after_s."),
+        _ends("detector.hang", "detector", "No inference returned for detection.hang_after_s."),
+        _ends("detector.failing", "detector", "Only failures for detection.hang_after_s."),
         _withholds(
             "detector.blind",
             "detector",
@@ -111,9 +112,10 @@ FAULT_KINDS: dict[str, FaultKind] = {
             "The service has not set the light for a second; its thread shows FAULT by itself.",
             clears=Clears.AT_ONCE,
         ),
-        _notice("light.error", "light", "The light cannot be opened or set."),
-        _notice("light.hang", "light", "The light's device does not answer."),
-        _notice(
+        # What the lamp shows is not known: the service must not say SAFE for it.
+        _stops("light.error", "light", "The light cannot be opened or set."),
+        _stops("light.hang", "light", "The light's device does not answer."),
+        _stops(
             "light.thread_ended",
             "light",
             "The light's thread has ended.",

@@ -2,8 +2,9 @@
 
 With CAP_PROP_CONVERT_RGB off OpenCV returns a V4L2 camera's Motion JPEG undecoded, and
 CAP_PROP_POS_MSEC is the kernel's time stamp of the buffer. Not run on a real camera yet: written
-from OpenCV's documentation and tested against a fake at cv2.VideoCapture. A read that the driver
-never answers cannot be ended from here; see `FrameGrabber.hung_s`.
+from OpenCV's documentation and tested against a fake at cv2.VideoCapture. OpenCV waits a second for
+a buffer of a V4L2 camera. A read that the driver itself does not end cannot be ended from here: see
+`FrameGrabber.replace_hung`.
 
 OpenCV gives no capture time for a network stream (RTSP, or Motion JPEG and others over HTTP), so
 its `captured_s` is the arrival time, after encoding and network: set the known part of that delay
@@ -18,7 +19,6 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from urllib.parse import urlsplit, urlunsplit
 
 import cv2
 
@@ -33,6 +33,7 @@ from bikeped.capture.opencv import (
     image_size,
     usable_fps,
 )
+from bikeped.capture.source_names import DeviceNames, shown_source
 from bikeped.errors import CaptureError
 from bikeped.types import Frame
 
@@ -44,7 +45,10 @@ MAX_STAMP_AGE_S = 2.0
 # OpenCV repeats its last buffer, without waiting, after some unplugs.
 MAX_REPEATING_S = 1.0
 REPEAT_PAUSE_S = 0.005
-TIMEOUT_MS = 5000
+# A camera that returns is ready 5 s later at most: an attempt that began before must end soon.
+OPEN_TIMEOUT_MS = 3500
+READ_TIMEOUT_MS = 1500
+DEVICE_NAMES = DeviceNames()
 
 
 class V4l2Source(OpenCvSource):
@@ -68,9 +72,11 @@ class V4l2Source(OpenCvSource):
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
         open_capture: OpenCapture = cv2.VideoCapture,
+        names: DeviceNames = DEVICE_NAMES,
     ) -> None:
-        path = f"/dev/video{int(device)}" if device.isdecimal() else device
-        super().__init__(path, path, "is it still plugged in?", open_capture)
+        device = f"/dev/video{int(device)}" if device.isdecimal() else device
+        path = names.find(device)
+        super().__init__(path, device, "is it still plugged in?", open_capture)
         if len(fourcc) != 4:
             raise CaptureError(f"camera.fourcc: {fourcc!r} must have four characters, e.g. MJPG")
         self.width, self.height = width, height
@@ -78,12 +84,15 @@ class V4l2Source(OpenCvSource):
         self._raw = fourcc in JPEG_FORMATS
         self._last: tuple[Image, float] | None = None
         self._last_s = -math.inf
+        # In seconds; OpenCV's own 10 s would delay a new capture. It is read with the first camera.
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
         self._open(cv2.CAP_V4L2)
         try:
             self.fps = self._set_up(fps, fourcc)
         except BaseException:
             self.close()
             raise
+        names.remember(device, path)
 
     def read(self) -> Frame:
         repeating_since_s: float | None = None
@@ -103,7 +112,7 @@ class V4l2Source(OpenCvSource):
             elif now_s - repeating_since_s > MAX_REPEATING_S:
                 raise CaptureError(f"{self.name}: repeats its last image; {self._remedy}")
             self._sleep(REPEAT_PAUSE_S)
-        size = image_size(image) if self._number == 0 else None
+        size = image_size(image)
         if size is not None and size != (self.width, self.height):
             raise CaptureError(
                 f"{self.name}: grants {self.width}x{self.height} but sends {size[0]}x{size[1]}; "
@@ -117,9 +126,9 @@ class V4l2Source(OpenCvSource):
         return self._frame(stamp_s, image)
 
     def _why_not_opened(self) -> str:
-        if not Path(self.name).exists():
+        if not Path(self._address).exists():
             return "no such camera; plug it in, or set camera.source (`v4l2-ctl --list-devices`)"
-        if not os.access(self.name, os.R_OK | os.W_OK):
+        if not os.access(self._address, os.R_OK | os.W_OK):
             return "no permission; add this user to group video"
         return "cannot be opened; is it a camera, and is another program using it (`fuser -v`)?"
 
@@ -165,7 +174,8 @@ def trim(data: bytes) -> bytes:
 class NetworkSource(FfmpegSource):
     """A live stream by its address. `fps` is assumed where the stream has no frame rate.
 
-    A stream that ends, fails or sends nothing for 5 s raises CaptureError.
+    A stream that ends, fails or sends nothing for 1.5 s raises CaptureError. A frame has the size
+    of its own picture, which a stream may change.
     """
 
     live = True
@@ -179,9 +189,11 @@ class NetworkSource(FfmpegSource):
         open_capture: OpenCapture = cv2.VideoCapture,
     ) -> None:
         remedy = "is the camera on, and are address, user and password right?"
-        timeouts = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
-        params = dict.fromkeys(timeouts, TIMEOUT_MS)
-        super().__init__(address, without_password(address), remedy, open_capture, params)
+        params = {
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: OPEN_TIMEOUT_MS,
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC: READ_TIMEOUT_MS,
+        }
+        super().__init__(address, shown_source(address), remedy, open_capture, params)
         self._clock = clock
         self._opened_s = clock()  # when the first frame, read by now, arrived
         self.fps = self.fps if usable_fps(self.fps) else fps
@@ -190,13 +202,5 @@ class NetworkSource(FfmpegSource):
         found = self._next()
         if found is None:
             raise CaptureError(f"{self.name}: the stream ended; is the camera still on?")
+        self.width, self.height = image_size(found[0]) or (self.width, self.height)
         return self._frame(self._clock() if self._number else self._opened_s, found[0])
-
-
-def without_password(address: str) -> str:
-    """The address without user, password and query, for logs."""
-    try:
-        parts = urlsplit(address)
-    except ValueError:
-        return address.split("://", 1)[0] + "://..."
-    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))

@@ -21,7 +21,8 @@ from bikeped.models import BUNDLED
 _PATH_KEYS = (
     *("camera.calibration", "detection.model", "detection.engine_cache", "audit.path"),
     *("feedback.sound.chime", "feedback.sound.bell", "web.token_file"),
-    *("mqtt.password_file", "mqtt.ca_file", "mqtt.cert_file", "mqtt.key_file"),
+    *("camera.password_file", "mqtt.password_file"),
+    *("mqtt.ca_file", "mqtt.cert_file", "mqtt.key_file"),
 )
 
 

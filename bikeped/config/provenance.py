@@ -28,7 +28,10 @@ MEASURING_CODE = ("lab/scenarios", "lab/simulation", "lab/experiments", "lab/gov
 
 #: Keys of the camera section that place no pixel on the ground; all others count as geometry. Of
 #: the calibration its content counts, not its name.
-_CAPTURE_KEYS = ("source", "fps", "fourcc", "stale_after_s", "hang_after_s", "calibration")
+_CAPTURE_KEYS = (
+    *("source", "username", "password_file", "fps", "fourcc", "stale_after_s", "hang_after_s"),
+    "calibration",
+)
 #: What the hashes of a provenance cover, in words.
 _COVERED = {
     "tracking_hash": "the tracking section",

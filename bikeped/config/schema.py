@@ -37,8 +37,13 @@ class CameraConfig(Section, frozen=True):
     """The camera: its source, its lens, and its pose above the ground."""
 
     source: Annotated[str, Meta(min_length=1)] = "/dev/video0"
-    """V4L2 device, video file, folder of images, or rtsp:// or http:// address; `bikeped run` wants
-    this key in the file"""
+    """V4L2 device, best by its lasting name below /dev/v4l/by-id; video file, folder of images, or
+    rtsp:// or http:// address; `bikeped run` wants this key in the file"""
+    username: Annotated[str, Meta(min_length=1)] | None = None
+    """user name of a network camera; null: none, or the one in the address"""
+    password_file: str | None = None
+    """file whose first line is the password of a network camera; null: none, or the one in the
+    address"""
     width: Annotated[int, Meta(ge=16, le=16384)] = 3840
     """sensor width requested from the camera, pixels"""
     height: Annotated[int, Meta(ge=16, le=16384)] = 2160
@@ -87,9 +92,9 @@ class CameraConfig(Section, frozen=True):
     """spacing of the ground table's lattice, crop pixels"""
     stale_after_s: Annotated[float, Meta(ge=0.05, le=2)] = 0.5
     """no frame for this long is a FAULT and a new capture, seconds"""
-    hang_after_s: Annotated[float, Meta(ge=1, le=60)] = 15.0
-    """a read that has not returned for this long ends the process, and systemd starts it again,
-    seconds"""
+    hang_after_s: Annotated[float, Meta(ge=1, le=60)] = 2.0
+    """a read that has not returned for this long is left behind and the camera opened anew; where
+    that does not work either, the process ends, and systemd starts it again, seconds"""
 
 
 class DetectionConfig(Section, frozen=True):
@@ -148,6 +153,9 @@ class DetectionConfig(Section, frozen=True):
     bundled model, and else a frame with confident detections, which is remembered in memory only"""
     silent_after_s: Annotated[float, Meta(ge=0.05, le=2)] = 0.5
     """no detector answer for this long is a FAULT, seconds"""
+    hang_after_s: Annotated[float, Meta(ge=1, le=60)] = 15.0
+    """an inference that has not returned, or failures only, for this long end the process, and
+    systemd starts it again, seconds"""
 
 
 class TrackingConfig(Section, frozen=True):

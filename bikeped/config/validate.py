@@ -38,6 +38,8 @@ def check_together(config: Config, source: str) -> None:
     if camera.calibration is None and None in (camera.radius_px, camera.fov_deg):
         problem = "camera.calibration: missing; name a calibration file, or set both "
         problem += "camera.radius_px and camera.fov_deg"
+    elif camera.password_file is not None and camera.username is None:
+        problem = "camera.password_file: without camera.username; set it too"
     elif (mqtt.cert_file is None) != (mqtt.key_file is None):
         problem = "mqtt.cert_file and mqtt.key_file: one without the other; set both"
     elif re.search(r"[\s/@?#]", mqtt.host) or re.fullmatch(r"[^:]*:\d+", mqtt.host):

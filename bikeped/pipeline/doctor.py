@@ -24,6 +24,7 @@ import numpy as np
 
 from bikeped.capture import open_source
 from bikeped.capture.jpeg import JpegDecoder
+from bikeped.capture.source_names import shown_source
 from bikeped.config.load import LoadedConfig
 from bikeped.errors import BikepedError, CaptureError
 from bikeped.feedback import open_light
@@ -117,15 +118,16 @@ def check_configuration(loaded: LoadedConfig) -> Finding:
 def check_camera(loaded: LoadedConfig) -> Finding:
     """Opens the camera, reads for a second, decodes the last frame."""
     camera = loaded.config.camera
+    name = shown_source(camera.source)
     try:
-        with open_source(camera) as source:
+        with open_source(camera, base_dir=loaded.base_dir) as source:
             last, more = source.read(), 0
             # Counted from the first frame on, which comes with what starting a camera takes.
             began = ended = time.monotonic()
             while ended - began < MEASURE_S and (frame := source.read()) is not None:
                 last, more, ended = frame, more + 1, time.monotonic()
         if last is None:
-            raise CaptureError(f"{camera.source}: holds no frame; set camera.source to another")
+            raise CaptureError(f"{name}: holds no frame; set camera.source to another")
     except CaptureError as error:
         return _failed(error, device=True)
     GroundMapper(loaded).framing_for(last.width, last.height)
@@ -133,7 +135,7 @@ def check_camera(loaded: LoadedConfig) -> Finding:
     if last.jpeg is not None:
         JpegDecoder().decode(last.jpeg)
     decode_ms = (time.perf_counter() - decoding) * 1e3
-    what = f"{camera.source}: {last.width} x {last.height}"
+    what = f"{name}: {last.width} x {last.height}"
     if not source.live:
         return Finding("warn", f"{what}, a recording", "set camera.source to a camera")
     fps = more / max(ended - began, 1e-9)

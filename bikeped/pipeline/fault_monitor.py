@@ -33,7 +33,7 @@ class Limits:
 
     stale_after_s: float = 0.5  #: no frame: FAULT
     silent_after_s: float = 0.5  #: no answer of the detector: FAULT
-    hang_after_s: float = 15.0  #: a call that does not return, a detector that only fails: end
+    hang_after_s: float = 15.0  #: a detector that does not return, or only fails: end
     tick_s: float = 0.1  #: between two checks
     close_s: float = 2.0  #: how long a thread may take to end
 
@@ -113,18 +113,17 @@ class FaultMonitor:
 
         `workers` run the decoder and the detector.
         """
+        if (problem := self._feed.replace_hung(now_s)) is not None:
+            raise StageHangError(Fault("camera", "camera.hang", problem))
         limit_s, busy_s = self._limits.hang_after_s, max(w.busy_s(now_s) for w in workers)
-        hung = [
-            ("camera", "camera.hang", self._feed.hung_s(now_s), "a read has not returned"),
-            ("detector", "detector.hang", busy_s, "has not returned"),
-        ]
+        hung = [("detector.hang", busy_s, "has not returned")]
         if (failing := self._failures.get("detector.error")) is not None:
             # A GPU that has failed once may fail until the process ends.
             lasted_s = now_s - failing.began_s
-            hung.append(("detector", "detector.failing", lasted_s, failing.fault.detail))
-        for source, code, lasted_s, text in hung:
+            hung.append(("detector.failing", lasted_s, failing.fault.detail))
+        for code, lasted_s, text in hung:
             if lasted_s > limit_s:
-                raise StageHangError(Fault(source, code, f"{text} for {limit_s:g} s"))
+                raise StageHangError(Fault("detector", code, f"{text} for {limit_s:g} s"))
         undecodable = self._failures.get("camera.undecodable")
         if undecodable is not None and now_s - undecodable.began_s > RESTART_AFTER_S:
             self._failures["camera.undecodable"] = _Failure(undecodable.fault, now_s)

@@ -29,9 +29,9 @@ class Feed:
         """Time since the newest frame arrived, on the loop's clock; infinite before the first."""
         return math.inf
 
-    def hung_s(self, now_s: float) -> float:
-        """How long the read in progress has not returned, in seconds."""
-        return 0.0
+    def replace_hung(self, now_s: float) -> str | None:
+        """Opens the source anew where a read hangs; why only a new process helps, else None."""
+        return None
 
     def restart(self) -> None:
         """Asks for the source to be opened anew: its frames cannot be used."""

@@ -22,6 +22,7 @@ from typing import Protocol
 
 import numpy as np
 
+from bikeped.capture.frame_grabber import FUTURE_S
 from bikeped.detection.detector import DetectionResult
 from bikeped.faults import Fault
 from bikeped.overlay.overlay_data import GroundToFrame, OverlayData, ground_projector
@@ -153,7 +154,7 @@ class Loop:
     async def run(self) -> None:
         """Runs until the recording ends or `stopping` is set; the light is then dark.
 
-        Raises StageHangError when a read or the detector has not returned for `hang_after_s`, and
+        Raises StageHangError when a stage hangs that only a new process can free, and
         leaves the light in FAULT; for a recording also the error of a frame that cannot be
         processed (GeometryError, DetectorError). Threads that hang are left behind: they are
         daemons.
@@ -203,15 +204,16 @@ class Loop:
             self._show_without_frame()
             return
         frame = decoded.frame
-        if not frame.captured_s > self._newest_s:
-            # A camera that was opened anew, on another clock. Its frames count again as soon as
-            # they are newer; until then the missing answers become a FAULT.
-            self.counts.out_of_order += 1
-            self._limited_log.warn("order", f"frame {frame.number} is skipped: its time went back")
-            return
-        self._newest_s = frame.captured_s
         # A recording has no other time than its own.
         now_s = self._clock() if self.feed.live else frame.captured_s
+        if not self._newest_s < frame.captured_s <= now_s + FUTURE_S:
+            # A repeated frame, or one of another clock, which must not count as the newest either:
+            # later ones would look old. Without others the missing answers become a FAULT.
+            self.counts.out_of_order += 1
+            why = "its time is not newer, or lies in the future"
+            self._limited_log.warn("order", f"frame {frame.number} is skipped: {why}")
+            return
+        self._newest_s = frame.captured_s
         age_s = max(0.0, now_s - frame.captured_s)
         tracking = self._track_and_decide.update(
             answer.detections, frame.width, frame.height, frame.captured_s, age_s

@@ -14,6 +14,7 @@ from bikeped import __version__
 from bikeped.capture import open_source
 from bikeped.capture.base import FrameSource
 from bikeped.capture.recordings import PacedSource
+from bikeped.capture.source_names import shown_source
 from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
@@ -87,28 +88,32 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
             audit.start()
             stack.push_async_callback(asyncio.to_thread, audit.close)
         stale_after_s = config.camera.stale_after_s
-        camera = LiveFeed(partial(_open_camera, loaded), stale_after_s=stale_after_s)
+        camera = LiveFeed(
+            partial(_open_camera, loaded),
+            stale_after_s=stale_after_s,
+            hang_after_s=config.camera.hang_after_s,
+        )
         application = Application(
             loaded,
             detector,
             TrackAndDecide(loaded, detector.cyclist_box_includes_rider, ground_mapper),
             stack,
             feed=camera,
-            source=config.camera.source,
+            source=shown_source(config.camera.source),
             light=light,
             mqtt=config.mqtt.enabled,
             pages=pages,
             speaker=speaker,
             audit=audit,
             limits=Limits(
-                stale_after_s, config.detection.silent_after_s, config.camera.hang_after_s
+                stale_after_s, config.detection.silent_after_s, config.detection.hang_after_s
             ),
             on_tick=partial(notify, "WATCHDOG=1"),
         )
         camera.start()
         await application.serve_pages()
         application.loop.stopping = stop  # which may be set already
-        notify("READY=1", f"STATUS=watching {config.camera.source}")
+        notify("READY=1", f"STATUS=watching {shown_source(config.camera.source)}")
         try:
             await application.run()
         except StageHangError as hang:
@@ -124,7 +129,7 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
 
 
 def _open_camera(loaded: LoadedConfig) -> FrameSource:
-    source = open_source(loaded.config.camera)
+    source = open_source(loaded.config.camera, base_dir=loaded.base_dir)
     # A recording in the camera's place is played at its own pace, as a rehearsal.
     return source if source.live else PacedSource(source)
 

@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 from aiohttp import hdrs, web
 
+from bikeped.capture.source_names import shown_source
 from bikeped.config.output_sections import WebConfig
 from bikeped.pipeline.application import WebContext
 from bikeped.telemetry.latency import STAGES
@@ -160,10 +161,10 @@ class LivePage:
 
 def display_source(source: str) -> str:
     """A camera's name without password or folder."""
-    if "://" in source:
-        scheme, _, rest = source.partition("://")
-        return f"{scheme}://{rest.rpartition('@')[2]}"
-    return source if source.startswith("/dev/") else PurePath(source).name or source
+    shown = shown_source(source)
+    if shown != source or source.startswith("/dev/"):
+        return shown
+    return PurePath(source).name or source
 
 
 def add_live(app: web.Application, live: LivePage) -> None:

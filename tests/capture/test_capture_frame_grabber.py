@@ -11,7 +11,7 @@ import threading
 import pytest
 
 from bikeped.capture.base import FrameSource
-from bikeped.capture.frame_grabber import FrameGrabber, backoff_s
+from bikeped.capture.frame_grabber import MAX_LEFT, OPENING_S, FrameGrabber, backoff_s
 from bikeped.capture.recordings import PacedSource, VideoSource
 from bikeped.errors import CaptureError
 from bikeped.types import Frame
@@ -177,16 +177,108 @@ def test_age_counts_from_the_last_arrival(bench):
     assert b.grabber.age_s(b.clock.now_s) == 0.0
 
 
-def test_a_read_that_does_not_return_is_shown(bench):
-    b = bench()
-    assert b.grabber.hung_s(b.clock.now_s) == 0.0
+async def test_a_read_that_does_not_return_is_left_and_a_new_capture_opened(bench):
+    b = bench(hang_after_s=2.0)
+    b.grabber.start()
+    hanging = b.opened()
+    hanging.give(_frame(1.0))
+    assert b.grabber.replace_hung(b.clock.now_s + 2.0) is None
+    assert b.opens == 1
+    assert b.grabber.replace_hung(b.clock.now_s + 2.1) is None
+    fresh = b.opened()
+    assert "a read has not returned for 2 s" in str(b.grabber.error)
+    fresh.give(_frame(2.0))
+    assert b.grabber.error is None
+    assert (await b.grabber.next(WAIT_S)).captured_s == 2.0
+    # What the old read returns at last is not the newest frame, and its device is closed.
+    hanging.answers.put(_frame(900.0))
+    assert hanging.closed.wait(WAIT_S)
+    fresh.give(_frame(3.0))
+    assert (await b.grabber.next(WAIT_S)).captured_s == 3.0
+    assert b.grabber.replace_hung(b.clock.now_s) is None
+
+
+def test_a_left_read_that_fails_does_not_count_against_the_new_capture(bench):
+    b = bench(hang_after_s=2.0)
+    b.grabber.start()
+    hanging = b.opened()
+    assert hanging.idle.wait(WAIT_S)
+    b.grabber.replace_hung(b.clock.now_s + 2.1)
+    b.opened().give(_frame(1.0))
+    hanging.answers.put(CaptureError("late"))
+    assert hanging.closed.wait(WAIT_S)
+    assert b.grabber.error is None
+
+
+def test_a_device_that_stays_busy_after_a_hang_needs_a_new_process(bench):
+    b = bench(hang_after_s=2.0, first_pause_s=1e6, max_pause_s=1e6)
+    fail, failed = b.grabber._failed, threading.Event()
+    b.grabber._failed = lambda *args: (fail(*args), failed.set())
+    b.grabber.start()
+    hanging = b.opened()
+    assert hanging.idle.wait(WAIT_S)
+    b.refusals.put(CaptureError("busy"))
+    b.clock.now_s += 2.1
+    assert b.grabber.replace_hung(b.clock.now_s) is None
+    assert failed.wait(WAIT_S)
+    assert b.grabber.replace_hung(b.clock.now_s + 2.0) is None
+    assert "busy" in b.grabber.replace_hung(b.clock.now_s + 2.1)
+    hanging.answers.put(CaptureError("the test is over"))
+
+
+def test_opening_may_take_longer_than_a_read():
+    clock, opening, go = Clock(), threading.Event(), threading.Event()
+
+    def open_slowly():
+        opening.set()
+        go.wait(WAIT_S)
+        raise CaptureError("the test is over")
+
+    grabber = FrameGrabber(open_slowly, clock=clock, hang_after_s=2.0)
+    grabber.start()
+    assert opening.wait(WAIT_S)
+    first = grabber._reader
+    grabber.replace_hung(clock.now_s + 2.0 + OPENING_S)
+    assert grabber._reader is first
+    grabber.replace_hung(clock.now_s + 2.1 + OPENING_S)
+    assert grabber._reader is not first
+    go.set()
+    assert grabber.stop(WAIT_S)
+
+
+def test_too_many_hanging_reads_need_a_new_process(bench):
+    b = bench(hang_after_s=2.0)
+    b.grabber.start()
+    sources = []
+    for number in range(MAX_LEFT + 1):
+        sources.append(b.opened())
+        assert sources[-1].idle.wait(WAIT_S)
+        b.clock.now_s += 2.1
+        problem = b.grabber.replace_hung(b.clock.now_s)
+        assert (problem is None) == (number < MAX_LEFT)
+    assert problem == "5 reads have not returned"
+    for source in sources:
+        source.answers.put(CaptureError("the test is over"))
+
+
+async def test_a_frame_from_the_future_is_dropped_and_later_ones_count(bench):
+    b = bench(stale_after_s=2.0)
     b.grabber.start()
     source = b.opened()
-    assert source.idle.wait(WAIT_S)
-    assert b.grabber.hung_s(b.clock.now_s + 7.0) == pytest.approx(7.0)
-    b.clock.now_s += 7.0
-    source.give(_frame(1.0))  # it returned, and the next read began just now
-    assert b.grabber.hung_s(b.clock.now_s) == 0.0
+    now_s = b.clock.now_s
+    source.give(_frame(now_s - 0.1), _frame(now_s + 3600.0), _frame(now_s - 0.05))
+    assert (await b.grabber.next(WAIT_S)).captured_s == now_s - 0.05
+    assert b.grabber.frames == 2
+
+
+def test_a_source_of_frames_from_the_future_alone_is_opened_anew(bench):
+    b = bench(stale_after_s=2.0)
+    b.grabber.start()
+    source = b.opened()
+    b.clock.now_s += 2.1
+    source.answers.put(_frame(b.clock.now_s + 60.0))
+    b.opened()
+    assert "time stamps of the past" in str(b.grabber.error)
 
 
 async def test_a_broken_source_is_closed_and_a_fresh_one_counts_on(bench):
@@ -264,6 +356,11 @@ def test_stop_closes_the_source_and_breaks_a_long_pause(bench):
 
 def test_stop_before_start_is_harmless(bench):
     assert bench().grabber.stop()
+
+
+def test_a_camera_that_was_away_for_long_is_tried_again_within_a_second(bench):
+    assert bench().grabber._max_pause_s == 0.002  # the tests' own
+    assert FrameGrabber(FakeSource)._max_pause_s <= 1.0
 
 
 def test_pauses_double_up_to_the_cap():

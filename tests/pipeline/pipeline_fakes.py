@@ -61,7 +61,7 @@ class FakeFeed:
         self.last_s: float | None = None
         self.error: Exception | None = None
         self.dropped = 0
-        self.hang_s = 0.0
+        self.hopeless: str | None = None
         self.restarts = 0
         self.closed = False
         self.number = 0
@@ -83,8 +83,8 @@ class FakeFeed:
     def age_s(self, now_s: float) -> float:
         return math.inf if self.last_s is None else now_s - self.last_s
 
-    def hung_s(self, now_s: float) -> float:
-        return self.hang_s
+    def replace_hung(self, now_s: float) -> str | None:
+        return self.hopeless
 
     def restart(self) -> None:
         self.restarts += 1

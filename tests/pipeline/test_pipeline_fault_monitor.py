@@ -11,7 +11,7 @@ from bikeped.faults import Fault, fault_texts
 from bikeped.pipeline.fault_monitor import FaultMonitor, Limits
 
 LIMITS = Limits(stale_after_s=0.5, silent_after_s=0.5)
-LAMP = Fault("light", "light.error", "unplugged")
+SPEAKER = Fault("speaker", "speaker.error", "unplugged")
 
 
 def monitor(
@@ -87,13 +87,21 @@ def test_a_failing_stage_explains_a_silence_and_is_none_by_itself():
 
 
 def test_a_notice_of_another_part_leaves_the_light_alone():
-    watch = monitor(10.0, 10.0, None, LAMP)
+    watch = monitor(10.0, 10.0, None, SPEAKER)
     assert watch.faults(10.0) == ()
-    assert watch.notices() == (LAMP,)
+    assert watch.notices() == (SPEAKER,)
 
 
 def test_a_fault_of_another_part_reaches_the_light():
     stuck = Fault("light", "light.not_refreshed", "stuck")
-    watch = monitor(10.0, 10.0, LAMP, stuck)
+    watch = monitor(10.0, 10.0, SPEAKER, stuck)
     assert watch.faults(10.0) == (stuck,)
-    assert watch.notices() == (LAMP,)
+    assert watch.notices() == (SPEAKER,)
+
+
+@pytest.mark.parametrize("code", ["light.error", "light.hang", "light.thread_ended"])
+def test_a_lamp_that_does_not_obey_is_a_fault_and_not_a_notice(code):
+    absent = Fault("light", code, "no such chip")
+    watch = monitor(10.0, 10.0, absent)
+    assert watch.faults(10.0) == (absent,)
+    assert watch.notices() == ()

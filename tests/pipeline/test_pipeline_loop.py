@@ -87,13 +87,37 @@ async def test_a_blocked_detector_is_a_fault_and_then_the_end():
         assert "detector: has not returned for 15 s" in rig.recorder.faults
 
 
-async def test_a_read_that_does_not_return_is_the_end():
+async def test_a_camera_that_cannot_be_opened_anew_after_a_hang_is_the_end():
     async with Rig() as rig:
         await rig.well()
-        rig.feed.hang_s = 15.1
+        rig.feed.hopeless = "a read has not returned, and the device is busy"
         with pytest.raises(StageHangError, match="camera: a read has not returned"):
             await rig.ended()
         assert rig.light.shown[-1].name == "FAULT"
+
+
+async def test_frames_from_the_future_are_dropped_and_do_not_outlast_themselves():
+    async with Rig() as rig:
+        await rig.well()
+        for _ in range(3):
+            rig.feed.put(rig.clock.now_s + 3600.0)
+        rig.feed.last_s = rig.clock.now_s
+        await rig.recorder.until(lambda: rig.loop.counts.out_of_order == 3)
+        await rig.frames(1)
+        assert rig.recorder.name == "IDLE"
+        assert rig.recorder.results[-1].decoded.frame.captured_s == rig.clock.now_s
+
+
+async def test_while_only_frames_from_the_future_come_the_light_shows_fault():
+    async with Rig() as rig:
+        await rig.well()
+        rig.clock.now_s += 0.6
+        rig.feed.put(rig.clock.now_s + 3600.0)
+        rig.feed.last_s = rig.clock.now_s
+        await rig.recorder.until(lambda: rig.recorder.name == "FAULT")
+        assert rig.recorder.faults == ("detector: no answer for more than 0.5 s",)
+        await rig.frames(5)
+        assert rig.recorder.name == "IDLE"
 
 
 @pytest.mark.parametrize("error", [DetectorError("out of memory"), RuntimeError("a bug")])

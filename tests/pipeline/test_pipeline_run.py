@@ -119,7 +119,7 @@ sys.exit(main(sys.argv[1:]))
 def test_a_hung_detector_is_a_fault_and_then_a_fresh_process(start, make_clip, small_config):
     service = start(
         small_config(make_clip("day.avi", 900)),
-        *("--set", "camera.hang_after_s=1.5"),
+        *("--set", "detection.hang_after_s=1.5"),
         program=HANGS,
     )
     service.until_said("IDLE: ")
@@ -146,11 +146,8 @@ def test_stopping_while_the_model_loads_is_prompt(start, small_config):
     assert "the light is off" in service.lines[-1]
 
 
-def until_safe_in_the_dark(address: str) -> dict[str, object]:
-    """The health report of a moment that is SAFE with a light that is known to have failed.
-
-    On a busy machine frames come late at times, and so does the USB library's answer.
-    """
+def until_safe(address: str) -> dict[str, object]:
+    """The health report of a moment that is SAFE: on a busy machine frames come late at times."""
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
@@ -160,13 +157,13 @@ def until_safe_in_the_dark(address: str) -> dict[str, object]:
         with answer:
             health = json.load(answer)
         assert (answer.status == 503) == (health["state"] == "FAULT")
-        if health["state"] == "SAFE" and not health["light"]["ok"]:
+        if health["state"] == "SAFE":
             return health
         assert time.monotonic() < deadline_s, health
 
 
-def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp_path):
-    """A dead broker, a full disk, no USB light, no sound: the crossing is watched all the same."""
+def test_everything_but_camera_and_light_is_broken(start, make_clip, small_config, tmp_path):
+    """A dead broker, a full disk, no sound: the crossing is watched all the same."""
     if shutil.disk_usage(tmp_path).free >= 1e12:
         pytest.skip("this disk has more room than audit.min_free_mb can ask for")
     config = small_config(
@@ -174,7 +171,7 @@ def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp
         more="  enabled: true\n  host: 127.0.0.1\n  port: 9\n"
         "web: {enabled: true, port: 0}\n"
         "audit: {path: audit.jsonl, min_free_mb: 1000000}\n"
-        "feedback: {light: usb, usb: {device: relay}, sound: {enabled: true, device: none}}\n",
+        "feedback: {light: simulated, sound: {enabled: true, device: none}}\n",
     )
     service = start(config)
     service.until_told("READY=1")
@@ -182,7 +179,7 @@ def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp
     base = "http://127.0.0.1:" + service.until_said(r"serving http://127\.0\.0\.1:(\d+)")[1]
     service.until_said("audit: .*no audit log while less than")
     service.until_said("mqtt: .*trying again")
-    health = until_safe_in_the_dark(f"{base}/healthz")
+    health = until_safe(f"{base}/healthz")
     jsonschema.validate(health, json.loads((SCHEMAS / "health.schema.json").read_text()))
     assert any(fault.startswith("audit: ") for fault in health["faults"])
     assert health["counters"]["frames"] > 0
@@ -191,6 +188,26 @@ def test_everything_but_the_camera_is_broken(start, make_clip, small_config, tmp
         assert b"bikeped_frames_total" in answer.read()
     assert not (tmp_path / "audit.jsonl").exists()
     assert service.stop() == 0
+
+
+def test_a_light_that_is_absent_at_the_start_is_fault_and_503(start, make_clip, small_config):
+    config = small_config(
+        make_clip("day.avi", 900),
+        more="web: {enabled: true, port: 0}\nfeedback: {light: usb, usb: {device: relay}}\n",
+    )
+    service = start(config)
+    service.until_said(r"FAULT: light: feedback\.usb\.device: no HID relay board")
+    service.until_said(r"health: FAULT.*[1-9]\d* processed")  # frames come, and are decided
+    base = "http://127.0.0.1:" + service.until_said(r"serving http://127\.0\.0\.1:(\d+)")[1]
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        urllib.request.urlopen(f"{base}/healthz", timeout=PATIENCE_S)
+    assert caught.value.code == 503
+    health = json.load(caught.value)
+    caught.value.close()
+    assert (health["state"], health["light"]["ok"]) == ("FAULT", False)
+    assert "light.error" in health["fault_codes"]
+    assert service.stop() == 0
+    assert "SAFE" not in service.log
 
 
 async def test_telemetry_of_the_service_from_the_first_fault_to_off(

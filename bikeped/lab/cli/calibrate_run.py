@@ -71,7 +71,10 @@ def live_pictures(
     guide = CaptureGuide(pattern, camera.width, camera.height, lens, centre)
     session = LiveSession(guide)
     page = live_page(session, port=loaded.config.web.port)
-    with contextlib.closing(open_source(camera)) as source, page as (url, error):
+    with (
+        contextlib.closing(open_source(camera, base_dir=loaded.base_dir)) as source,
+        page as (url, error),
+    ):
         screen.print(f"pictures go into {escape(str(folder))}; Ctrl-C when you have enough")
         screen.print(f"open {url}" if url else f"no page: {error}")
         try:
