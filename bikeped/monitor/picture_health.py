@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 
 from bikeped.monitor.known_scene import KnownScene
@@ -19,7 +20,7 @@ from bikeped.monitor.reduced_picture import (
 from bikeped.monitor.repeated_pictures import RepeatedPictures
 from bikeped.monitor.sharpness import Sharpness
 from bikeped.monitor.verdicts import Hold, Verdict
-from bikeped.types import ImageArray
+from bikeped.types import BoolArray, Float32Array, ImageArray
 
 _EVERY_S = 0.2  #: all but repeated pictures is judged this often
 _JUMP_S = 5.0  #: a longer gap begins the holds anew
@@ -28,12 +29,10 @@ _FLAT = (
     3.0,
     8.0,
 )  #: grey levels between the tiles of a dark, and of another, picture of one colour
-_DARK, _BRIGHT = 20.0, 235.0
+_DARK, _BRIGHT, _BORDER = 20.0, 235.0, 8.0
 _LOST = 0.5  #: of the known structures (`KnownScene`)
 _BLURRED = 1.25  #: sharpness (`Sharpness`) that is too little at any site
 _BLURRED_SHARE = 0.4  #: of the site's own above 1
-#: Share of the parts: at least the first, and the second above 1.1 times the site's own.
-_SPRAYED = (0.1, 0.06)
 _UNDEREXPOSED = 25.0  #: grey levels of the brightest tenth
 _CLIPPED, _OVEREXPOSED = 250.0, 0.35  #: grey levels, and the share of the picture above them
 _CODES = (
@@ -75,7 +74,7 @@ class PictureHealth:
                 "picture.covered", 2.0, "What the picture showed is hidden, or the camera turned."
             ),
             Hold("picture.blurred", 2.5, "The picture is blurred."),
-            Hold("picture.spray", 4.0, "Parts of the picture are blurred: drops or dirt."),
+            Hold("picture.spray", 4.5, "Parts of the picture are blurred: drops or dirt."),
             Hold("picture.underexposed", 5.0, "The picture is very dark."),
             Hold("picture.overexposed", 5.0, "Much of the picture is overexposed."),
         )
@@ -116,11 +115,10 @@ class PictureHealth:
         region = inside(*grid, self._circle, width / height)
         if self._scene is None:
             self._scene = KnownScene(picture.coarse, region)
-        levels = tiles(picture.coarse.astype(np.float32))[region]
-        means = levels.mean(axis=-1)
-        lit = means > _DARK
-        if self._circle is None and lit.mean() > 0.1:
-            means = means[lit]  # not the black around an image circle or a letter box
+        levels = tiles(picture.coarse.astype(np.float32))
+        grid_means = levels.mean(axis=-1)
+        means = grid_means[_lit(grid_means, region)]
+        levels = levels[region]
         low, middle, high = np.quantile(means, (0.01, 0.5, 0.99)).tolist()
         spread = high - low
         flat = _FLAT[0] if middle < _DARK else _FLAT[1]
@@ -149,10 +147,7 @@ class PictureHealth:
             "one_colour": (even if _DARK <= middle <= _BRIGHT else 0.0, 1.0),
             "covered": (lost, _LOST),
             "blurred": (blurred / max(sharp, 0.01) * flatness, 1.0),
-            "spray": (
-                sprayed * flatness,
-                max(_SPRAYED[0], _SPRAYED[1] + 1.1 * self._sharpness.usual_share),
-            ),
+            "spray": (sprayed * flatness, self._sharpness.parts_limit),
             "underexposed": (_UNDEREXPOSED / max(float(np.quantile(means, 0.9)), 0.1), 1.0),
             "overexposed": (float((levels > _CLIPPED).mean()), _OVEREXPOSED),
         }
@@ -160,3 +155,13 @@ class PictureHealth:
             hold.update(*values[code], self._time_s)
             for code, hold in zip(_CODES, self._holds[1:], strict=True)
         )
+
+
+def _lit(means: Float32Array, region: BoolArray) -> BoolArray:
+    """The tiles [m, n] of `region` without the black around an image circle or a letter box."""
+    bright = (means > _BORDER).astype(np.uint8)
+    # One tile further in: those on the edge are part black.
+    square = np.ones((3, 3), np.uint8)
+    within = cv2.erode(bright, square, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,))
+    lit = region & (within > 0)
+    return lit if lit.sum() > 0.1 * region.sum() else region

@@ -35,7 +35,8 @@ class Reduced:
 
 def usable(rgb: ImageArray) -> bool:
     """Whether this is a picture [h, w, 3] large enough to judge."""
-    return rgb.ndim == 3 and rgb.shape[2] == 3 and min(rgb.shape[:2]) >= _MIN_PX
+    colours = rgb.ndim == 3 and rgb.shape[2] == 3 and rgb.dtype == np.uint8
+    return colours and min(rgb.shape[:2]) >= _MIN_PX
 
 
 def reduce(rgb: ImageArray) -> Reduced:

@@ -89,6 +89,7 @@ class RepeatedPictures:
         # Neighbours' difference: flicker of lamps and clouds, which are periodic, cancel out.
         now, before = samples.astype(np.float32), self._last.astype(np.float32)
         change = now[0] - now[1] - before[0] + before[1]
+        noisy = float((change != 0).mean()) > 0.5 * _NOISY_SHARE  # more than a walker
         limit = 1.0 + 4.0 * float(np.abs(change).mean())
         change = np.clip(change, -limit, limit)
         change -= change.mean()
@@ -102,8 +103,8 @@ class RepeatedPictures:
             change = np.zeros_like(change)
         self._changes.appendleft(change)
         between = self._lag_match[1:-1]
-        beside = np.maximum(self._lag_match[:-2], self._lag_match[2:])
-        return bool((between - beside).max() > _LOOP)
+        beside = np.maximum(np.maximum(self._lag_match[:-2], self._lag_match[2:]), 0.0)
+        return noisy and bool((between - beside).max() > _LOOP)
 
 
 def _samples(rgb: ImageArray) -> ImageArray:

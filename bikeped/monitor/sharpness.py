@@ -7,8 +7,6 @@ Only what two pictures, one after the other, have in common counts: not noise, n
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 
@@ -27,9 +25,8 @@ _SHARP = 1.3  #: a part that has been sharper than this can be seen to lose it
 _PART_SHARP, _PART_LEFT = 0.85, 0.65
 _FEW = 8
 _KNOWN_S = 2.0
-_SHARE_FORGET_S = 40.0
-_SHARE_MOST = 0.12  #: blurred parts are usual up to this share, and a fault beyond it
 _FORGET_S = 60.0
+_PARTS, _PARTS_ABOVE = 0.08, 0.05  #: share of blurred parts that is too much, see `parts_limit`
 _KERNELS = [cv2.getGaussianKernel(2 * int(3 * s) + 1, s).astype(np.float32) for s in _SIGMAS]
 _ONE = np.ones(1, np.float32)
 
@@ -54,9 +51,9 @@ class Sharpness:
         return self._usual if self._seen_s >= _KNOWN_S else float("nan")
 
     @property
-    def usual_share(self) -> float:
-        """Share of parts that count as blurred while nothing is wrong: rain, noise."""
-        return self._usual_share
+    def parts_limit(self) -> float:
+        """Share of blurred parts that is too much here: the site's own in rain and noise counts."""
+        return max(_PARTS, _PARTS_ABOVE + self._usual_share)
 
     def update(self, lines: ImageArray, passed_s: float, learn: bool) -> tuple[float, float]:
         """Sharpness of the whole picture, and the share of its parts that lost theirs; or NaN.
@@ -77,10 +74,9 @@ class Sharpness:
             constant_s = self._seen_s if self._seen_s <= _KNOWN_S else _FORGET_S
             weight = min(1.0, passed_s / constant_s)
             self._usual += weight * (sharp - self._usual)
-            if not math.isnan(share):
-                quick = min(1.0, passed_s / min(self._seen_s, _SHARE_FORGET_S))
+            if share < 0.6 * self.parts_limit:  # not while drops gather; never with NaN
+                quick = min(1.0, passed_s / min(self._seen_s, _FORGET_S))
                 self._usual_share += quick * (share - self._usual_share)
-                self._usual_share = min(self._usual_share, _SHARE_MOST)
             self._usual_energy += weight * np.where(lost, 0, energy - self._usual_energy)
         return sharp, share
 
@@ -101,8 +97,12 @@ class Sharpness:
             usual_part - 1.0
         )
         left = energy[0] / np.maximum(usual_fine, 1e-6)
-        lost = judged & blurred & (left < _PART_LEFT * min(1.0, float(np.median(left[judged]))))
-        return float(lost.sum() / judged.sum()), lost
+        left = left / min(1.0, max(float(np.median(left[judged])), 1e-6))
+        lost = judged & blurred & (left < _PART_LEFT)
+        # Where the camera sways, some parts gain the edges that others lose.
+        gained = judged & (left > 1.0 / _PART_LEFT)
+        share = (float(lost.sum()) - float(gained.sum())) / float(judged.sum())
+        return max(share, 0.0), lost
 
     def _measure(self, lines: ImageArray, passed_s: float) -> None:
         """Updates the energies of slopes."""
