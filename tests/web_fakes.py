@@ -84,6 +84,7 @@ def health(**changes: Any) -> HealthMessage:
         "camera": CameraHealth(ok=True, detail="frames arrive", capture_age_ms=23.0),
         "picture": ComponentStatus(ok=False, detail="picture: The picture is blurred."),
         "checks": [check_status(Verdict("picture.blurred", 1.5, 1.0, 2.5, True, "blurred"))],
+        "detector_watch": None,
         "drift": drift_status(Drift(pixels=4.5, degrees=0.3, metres_at_10m=0.16, since_start=True)),
         "detector": ComponentStatus(ok=True, detail="answers"),
         "light": ComponentStatus(ok=True, detail="simulated"),

@@ -98,21 +98,21 @@ class DetectorCheck:
         return not (self._failed_in_row or self._ignores_motion)
 
     @property
-    def verdicts(self) -> tuple[Verdict, Verdict]:
-        """On the check picture, in failures in a row, and on motion, in seconds of it."""
-        failed, motion_s = float(self._failed_in_row), self._motion_s
-        if self._silent_s() < SILENT_S or self._movers < MOVERS:
-            motion_s = 0.0
-        return (
-            Verdict(CODE, failed, FAILURES, 0.0, failed >= FAILURES, _MISSED),
-            Verdict(CODE, motion_s, MOTION_S, SILENT_S, self._ignores_motion, _MOVES),
-        )
+    def verdict(self) -> Verdict:
+        """Failures in a row or seconds of motion, the worse, as a share of what may not be."""
+        failed, moved = self._failed_in_row / FAILURES, 0.0
+        if self._silent_s() >= SILENT_S and self._movers >= MOVERS:
+            moved = self._motion_s / MOTION_S
+        missed = failed >= 1
+        active = missed or self._ignores_motion
+        text = _MISSED if missed else _MOVES
+        return Verdict(CODE, max(failed, moved), 1.0, 0.0, active, text)
 
     @property
     def fault(self) -> Fault | None:
         """The fault to report, if there is one."""
-        texts = [verdict.detail for verdict in self.verdicts if verdict.active]
-        return Fault("detector", CODE, texts[0]) if texts else None
+        verdict = self.verdict
+        return Fault("detector", CODE, verdict.detail) if verdict.active else None
 
     @property
     def numbers(self) -> DetectorNumbers:

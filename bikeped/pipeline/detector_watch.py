@@ -143,9 +143,9 @@ class DetectorWatch:
         return self._check.fault
 
     @property
-    def verdicts(self) -> tuple[Verdict, ...]:
+    def verdict(self) -> Verdict:
         """What the fault is judged by."""
-        return self._check.verdicts
+        return self._check.verdict
 
     @property
     def numbers(self) -> DetectorNumbers:

@@ -25,6 +25,7 @@ import numpy as np
 from bikeped.capture.frame_grabber import FUTURE_S
 from bikeped.detection.detector import DetectionResult
 from bikeped.faults import Fault
+from bikeped.monitor.verdicts import Verdict
 from bikeped.overlay.overlay_data import GroundToFrame, OverlayData, ground_projector
 from bikeped.pipeline.detection_scheduler import (
     DecodedFrame,
@@ -145,6 +146,11 @@ class Loop:
         self.stopping = asyncio.Event()  #: set it to end `run`
         self._first_s: float | None = None  # capture time of the first result
         self._newest_s = -math.inf  # capture time of the newest result
+
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """All checks of the newest picture, and of the detector where it is watched."""
+        watched = () if self.watch is None else (self.watch.verdict,)
+        return (*self.monitor.picture.verdicts, *watched)
 
     def frame_age_s(self) -> float | None:
         """Age of the newest frame of a live feed; None before the first."""

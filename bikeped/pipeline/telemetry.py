@@ -27,6 +27,7 @@ from bikeped.telemetry.builders import (
     json_number,
     rfc3339,
     tracks_message,
+    watch_status,
 )
 from bikeped.telemetry.event_files import AuditLog
 from bikeped.telemetry.latency import StageTimes
@@ -157,9 +158,10 @@ class Telemetry:
                 capture_age_ms=None if age_ms is None else json_number(age_ms, 1),
             ),
             picture=_status("picture", faults, "good"),
-            checks=[check_status(verdict) for verdict in picture.verdicts],
+            checks=[check_status(verdict) for verdict in loop.verdicts()],
             drift=None if picture.drift is None else drift_status(picture.drift),
             detector=_status("detector", faults, "answers"),
+            detector_watch=None if loop.watch is None else watch_status(loop.watch.numbers),
             light=_status("light", faults, light),
             faults=list(fault_texts(faults)),
             fault_codes=[fault.code for fault in faults],
@@ -202,7 +204,8 @@ class Telemetry:
                 light_errors=light_errors,
                 counters=self._counters(loop),
                 fault_codes=[fault.code for fault in self._faults(loop)],
-                verdicts=loop.monitor.picture.verdicts,
+                verdicts=loop.verdicts(),
+                watch=None if loop.watch is None else loop.watch.numbers,
                 drift=loop.monitor.picture.drift,
             )
 

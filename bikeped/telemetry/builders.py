@@ -20,6 +20,7 @@ import numpy.typing as npt
 from bikeped.errors import TelemetryError
 from bikeped.faults import Fault
 from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.detector_check import DetectorNumbers
 from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry import schema as messages
 from bikeped.telemetry.schema import EventHeader, EventLine, EventTrack, KindLabel, ShownState
@@ -110,6 +111,12 @@ def check_status(verdict: Verdict) -> messages.CheckStatus:
         hold_s=verdict.hold_s,
         active=verdict.active,
     )
+
+
+def watch_status(numbers: DetectorNumbers) -> messages.DetectorWatchStatus:
+    """The watch over the detector as it stands in the health message."""
+    values = {k: round(v, 1) if isinstance(v, float) else v for k, v in vars(numbers).items()}
+    return msgspec.convert(values, messages.DetectorWatchStatus)
 
 
 def drift_status(drift: Drift) -> messages.DriftStatus:

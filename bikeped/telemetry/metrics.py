@@ -14,6 +14,7 @@ import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Enum, Gauge, Histogram
 
 from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.detector_check import DetectorNumbers
 from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry.latency import STAGES
 from bikeped.telemetry.schema import Counters, ShownState
@@ -58,11 +59,13 @@ class Metrics:
         self._fault = Gauge("fault", "1 while a fault of this code is present", ["code"], **new)
         check = {"labelnames": ["check"], **new}
         self._checks = {
-            "value": Gauge("check_value", "Newest value of a check of the picture", **check),
+            "value": Gauge("check_value", "Newest value of a check", **check),
             "threshold": Gauge("check_threshold", "The value that may not be reached", **check),
             "active": Gauge("check_active", "1 while the check stops or withholds", **check),
         }
         self._drift = Gauge("drift", "The camera against its reference", ["measure"], **new)
+        watch = "Known answers and motion: the watch over the detector"
+        self._watch = Gauge("detector_watch", watch, ["measure"], **new)
         self._mqtt_connected = Gauge("mqtt_connected", "1 while the broker is connected", **new)
         # Label lookups take a lock and a dictionary each; done once, and zeros are visible early.
         self._stage = {stage: latency.labels(stage) for stage in STAGES}
@@ -108,6 +111,7 @@ class Metrics:
         fault_codes: Sequence[str] = (),
         verdicts: Sequence[Verdict] = (),
         drift: Drift | None = None,
+        watch: DetectorNumbers | None = None,
     ) -> None:
         """Sets the gauges, and brings the counters up to totals counted elsewhere.
 
@@ -125,6 +129,8 @@ class Metrics:
                 gauge.labels(verdict.code).set(getattr(verdict, field))
         for measure in ("pixels", "degrees", "metres_at_10m"):
             self._drift.labels(measure).set(getattr(drift, measure, math.nan))
+        for measure, number in ({} if watch is None else vars(watch)).items():
+            self._watch.labels(measure).set(math.nan if number is None else number)
         for key, counter in self._counters.items():
             total = light_errors if key == "light_errors" else getattr(counters, key)
             if total > self._totals[key]:

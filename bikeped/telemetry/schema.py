@@ -120,7 +120,7 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CheckStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One check of the picture: its number now, and from where on it counts."""
+    """One check of the picture or the detector: its number now, and from where on it counts."""
 
     code: str
     value: Annotated[float | None, Meta(description="null while it cannot be measured")]
@@ -145,6 +145,16 @@ class DriftStatus(msgspec.Struct, frozen=True, kw_only=True):
     since_start: Annotated[bool, Meta(description="no alignment saved a reference")]
 
 
+class DetectorWatchStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of the detector by known answers and by motion."""
+
+    check_age_s: Annotated[float | None, Meta(description="since known answers were asked for")]
+    check_passes: Count
+    check_failures: Count
+    motion_s: Annotated[float, Meta(description="of the last 60 s with motion on the road")]
+    detection_age_s: Annotated[float | None, Meta(description="since the newest detection")]
+
+
 class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
     """`bikeped/<site>/health`, every 10 s by default, retained."""
 
@@ -157,9 +167,12 @@ class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
     latency_ms: Annotated[dict[str, StageLatency], Meta(description="by stage")]
     camera: CameraHealth
     picture: ComponentStatus
-    checks: Annotated[list[CheckStatus], Meta(description="of the picture, each with its number")]
+    checks: Annotated[
+        list[CheckStatus], Meta(description="of the picture and the detector, each with its number")
+    ]
     drift: DriftStatus | None
     detector: ComponentStatus
+    detector_watch: DetectorWatchStatus | None
     light: ComponentStatus
     faults: Annotated[list[str], Meta(description="what is wrong, one line each; empty: nothing")]
     fault_codes: Annotated[

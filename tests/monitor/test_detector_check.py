@@ -81,8 +81,8 @@ def test_much_motion_and_no_detection_is_a_fault_until_something_is_found() -> N
     assert check.fault is None
     now_s = watch(check, now_s, 1.0, motion_s=MOTION_S)
     assert check.fault is not None
-    assert check.verdicts[1].active
-    assert check.verdicts[1].value == MOTION_S
+    assert check.verdict.active
+    assert check.verdict.value == check.verdict.threshold == 1.0
     now_s = watch(check, now_s, 30.0)  # the street is empty now, the model as blind as before
     assert check.fault is not None
     assert not check.trusted

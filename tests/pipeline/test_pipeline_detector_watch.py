@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from pipeline_fakes import RGB, Rig, seen, small
 
+from bikeped.cli.main import main
 from bikeped.config.build import ground_camera, road_region
 from bikeped.config.load import LoadedConfig, load_config
 from bikeped.detection.detector import load_detector
@@ -67,7 +68,8 @@ def test_a_model_that_falls_silent_is_noticed_with_a_remembered_frame() -> None:
             assert rig.watch is not None
             assert rig.watch.numbers.check_failures >= 2
             assert rig.watch.numbers.check_passes >= 1
-            assert not any(verdict.active for verdict in rig.watch.verdicts)
+            assert not rig.watch.verdict.active
+            assert rig.loop.verdicts()[-1] == rig.watch.verdict
 
     asyncio.run(scenario())
 
@@ -241,3 +243,21 @@ def test_only_what_is_well_above_the_threshold_is_known() -> None:
     found = Detections(np.zeros(3, np.int8), confidence, np.zeros((3, 4), np.float32))
     assert len(known_answers(found, 0.1)) == 2
     assert len(known_answers(found, 0.6)) == 1
+
+
+def test_align_saves_the_sites_picture_when_asked(tmp_path: Path) -> None:
+    loaded = load_config(None, ("detection.model=bundled", "detection.threads=1"))
+    detector = load_detector(loaded.config.detection, loaded.base_dir, road_region(loaded))
+    size = (1920, 1080)
+    drawn = drawn_check_picture(size, detector.decode_size(*size), detector.region)
+    street, empty, saved = tmp_path / "street.jpg", tmp_path / "empty.jpg", tmp_path / "check.jpg"
+    for file, rgb in ((street, drawn.rgb), (empty, drawn.rgb * 0)):
+        write_check_picture(file, rgb, drawn.known, None)  # a JPEG file
+    options = ["--set", "detection.model=bundled", "--set", "detection.threads=1"]
+    assert main(["align", str(street), *options, "--check-picture", str(saved)]) == 0
+    picture, digest = read_check_picture(saved)
+    assert digest == detector.model_hash
+    found = detector.infer(picture.rgb, picture.frame.width, picture.frame.height).detections
+    assert finds_again(picture.known, found)
+    assert main(["align", str(empty), *options, "--check-picture", str(saved)]) != 0
+    assert main(["align", str(street), *options, "--check-picture", "check.png"]) != 0

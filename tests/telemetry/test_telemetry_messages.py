@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from bikeped.errors import TelemetryError
 from bikeped.faults import Fault
 from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.detector_check import DetectorNumbers
 from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry import builders as m
 from bikeped.telemetry import schema as wire
@@ -90,6 +91,7 @@ HEALTH = wire.HealthMessage(
     latency_ms={"total": wire.StageLatency(p50=1.23, p95=2.0, p99=3.0, max=4.0)},
     camera=wire.CameraHealth(ok=False, detail="no frame for 2 s", capture_age_ms=None),
     detector=wire.ComponentStatus(ok=True, detail="onnxruntime, CPU"),
+    detector_watch=m.watch_status(DetectorNumbers(12.34, 3, 0, 4.56, None)),
     light=wire.ComponentStatus(ok=True, detail="gpio"),
     picture=wire.ComponentStatus(ok=False, detail="The picture is blurred."),
     checks=[m.check_status(BLURRED)],

@@ -10,6 +10,7 @@ import pytest
 from prometheus_client import REGISTRY
 
 from bikeped.monitor.camera_drift import Drift
+from bikeped.monitor.detector_check import DetectorNumbers
 from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.schema import Counters
@@ -123,7 +124,11 @@ def test_checks_drift_and_faults_by_code():
     metrics = Metrics()
     blurred = Verdict("picture.blurred", 1.5, 1.0, 2.5, True, "The picture is blurred.")
     drift = Drift(pixels=30.0, degrees=2.0, metres_at_10m=1.1)
-    update(metrics, fault_codes=["camera.moved"], verdicts=[blurred], drift=drift)
+    watch = DetectorNumbers(None, 3, 1, 4.5, 0.2)
+    update(metrics, fault_codes=["camera.moved"], verdicts=[blurred], drift=drift, watch=watch)
+    assert value(metrics, "detector_watch", measure="motion_s") == 4.5
+    assert value(metrics, "detector_watch", measure="check_passes") == 3
+    assert math.isnan(value(metrics, "detector_watch", measure="check_age_s") or 0)
     assert value(metrics, "fault", code="camera.moved") == 1
     assert value(metrics, "check_value", check="picture.blurred") == 1.5
     assert value(metrics, "check_threshold", check="picture.blurred") == 1
