@@ -13,6 +13,7 @@ from bikeped.cli.guard import guarded
 from bikeped.config.load import default_config_path, load_config
 from bikeped.errors import BikepedError
 from bikeped.pipeline.doctor import Finding, checks, run_checks
+from bikeped.pipeline.single_instance import holder
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skipped": "dim"}
 
@@ -40,7 +41,7 @@ def command(
             raise  # the command line is wrong, not the installation
         findings.append(Finding("fail", str(error), "the other checks need it", "configuration"))
     else:
-        todo = checks(light=not no_light, sound=not no_sound)
+        todo = checks(light=not no_light, sound=not no_sound, beside=holder(loaded))
         with console("-").status("checking") as status:  # on standard error
             for finding in run_checks(loaded, todo):
                 findings.append(finding)

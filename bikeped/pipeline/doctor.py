@@ -17,6 +17,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -45,6 +46,7 @@ LAMP_S = 0.4  #: how long each colour shows
 FIRST_YEAR = 2025  #: a clock before this was never set
 HOT_C = 85.0  #: a Jetson throttles a few degrees above this
 MB = 1_000_000
+BESIDE_SERVICE_S = 18.0  #: all checks, while a service runs
 
 
 @dataclass(frozen=True)
@@ -61,24 +63,38 @@ class Finding:
 Check = tuple[str, Callable[[LoadedConfig], Finding], float]
 
 
-def checks(*, light: bool = True, sound: bool = True) -> tuple[Check, ...]:
-    """All checks in the order of the table; without `light` no lamp is touched."""
-    return (
+def checks(
+    *, light: bool = True, sound: bool = True, beside: tuple[str, int] | None = None
+) -> tuple[Check, ...]:
+    """All checks in the order of the table; without `light` no lamp is touched.
+
+    `beside` a running service (what it holds, and its pid) nothing that it may hold is touched, and
+    all together take at most `BESIDE_SERVICE_S`.
+    """
+    skip = None
+    if beside is not None:
+        held = f"{beside[0]} is in use by the running service (pid {beside[1]})"
+        skip = _skip(held, "its pages, /healthz and MQTT say how it does")
+    shine = check_light if light else _skip("left out by --no-light")
+    play = check_speaker if sound else _skip("left out by --no-sound")
+    found: tuple[Check, ...] = (
         ("configuration", check_configuration, 60),
-        ("camera", check_camera, 30),
+        ("camera", skip or check_camera, 30),
         # Building an engine for the first time takes minutes.
-        ("model", check_model, 1800),
-        ("light", check_light if light else _skip("--no-light"), 15),
-        ("speaker", check_speaker if sound else _skip("--no-sound"), 15),
-        ("broker", check_broker, 15),
+        ("model", skip or check_model, 1800),
+        ("light", skip or shine, 15),
+        ("speaker", skip or play, 15),
+        ("broker", partial(check_broker, timeout_s=1.5) if skip else check_broker, 15),
         ("clock", check_clock, 10),
         ("disk", check_disk, 10),
         ("machine", check_machine, 10),
     )
+    most_s = math.inf if skip is None else BESIDE_SERVICE_S / len(found)
+    return tuple((name, check, min(limit_s, most_s)) for name, check, limit_s in found)
 
 
-def _skip(option: str) -> Callable[[LoadedConfig], Finding]:
-    return lambda _loaded: Finding("skipped", f"left out by {option}")
+def _skip(why: str, remedy: str = "") -> Callable[[LoadedConfig], Finding]:
+    return lambda _loaded: Finding("skipped", why, remedy)
 
 
 def run_checks(loaded: LoadedConfig, todo: Iterable[Check]) -> Iterator[Finding]:
@@ -210,7 +226,7 @@ def check_speaker(loaded: LoadedConfig) -> Finding:
     return Finding("ok", f"{sound.device}: did you hear the chime?")
 
 
-def check_broker(loaded: LoadedConfig) -> Finding:
+def check_broker(loaded: LoadedConfig, timeout_s: float = 5.0) -> Finding:
     """Connects to the broker, with a client id of its own: the service's connection stays."""
     mqtt = loaded.config.mqtt
     if not mqtt.enabled:
@@ -219,7 +235,7 @@ def check_broker(loaded: LoadedConfig) -> Finding:
         mqtt,
         load_credentials(mqtt, loaded.base_dir),
         client_id=f"bikeped-doctor-{os.getpid()}",
-        timeout_s=5.0,
+        timeout_s=timeout_s,
     )
     began = time.perf_counter()
     try:
@@ -295,7 +311,7 @@ def _output_of(program: str, *arguments: str) -> str | None:
     """What a program prints; None when it is not there or fails."""
     command = [program, *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, timeout=5, check=False, text=True)
+        done = subprocess.run(command, capture_output=True, timeout=2, check=False, text=True)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None

@@ -29,6 +29,7 @@ from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.runtime import WorkerThread, notify
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
+from bikeped.pipeline.single_instance import claimed
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
 from bikeped.telemetry.event_files import AuditLog
 
@@ -70,6 +71,7 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
     config, ground_mapper = loaded.config, GroundMapper(loaded)
     light = light_driver(config.feedback)
     async with contextlib.AsyncExitStack() as last, contextlib.AsyncExitStack() as stack:
+        last.enter_context(claimed(loaded))
         light.start()  # shows FAULT until the first signal
         last.push_async_callback(_darken, light)  # done last, whatever ends the service
         if detector is None:

@@ -9,27 +9,13 @@ import signal
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jsonschema
 import pytest
-from small_crossing import PATIENCE_S, Service
+from small_crossing import PATIENCE_S
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "messages"
-
-
-@pytest.fixture
-def start() -> Iterator[Callable[..., Service]]:
-    services: list[Service] = []
-
-    def begin(*arguments: object, **options: object) -> Service:
-        services.append(Service(*arguments, **options))  # type: ignore[arg-type]
-        return services[-1]
-
-    yield begin
-    for service in services:
-        service.close()
 
 
 def test_a_recording_in_the_cameras_place_ready_watched_and_stopped(start, make_clip, small_config):
