@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.faults import Fault
+from bikeped.lamp.colours import Colour as Colour
 
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
@@ -202,16 +203,6 @@ class Decision:
     state: State
     sentence: str
     pair: PairMetrics | None = None  #: the first that fires (ALERT) or the nearest (WARNING)
-
-
-class Colour(str, enum.Enum):
-    """Colours of the light."""
-
-    OFF = "off"
-    BLUE = "blue"
-    GREEN = "green"
-    ORANGE = "orange"
-    RED = "red"
 
 
 class Sound(str, enum.Enum):

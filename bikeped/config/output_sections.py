@@ -78,8 +78,9 @@ class SoundConfig(Section, frozen=True):
 class FeedbackConfig(Section, frozen=True):
     """The light and the speaker."""
 
-    light: Literal["simulated", "gpio", "usb"] = "simulated"
-    """simulated writes to the log; `bikeped run` wants this key in the file"""
+    light: Literal["simulated", "gpio", "usb", "lamp"] = "simulated"
+    """simulated writes to the log; lamp: a process of its own drives it, see the section lamp;
+    `bikeped run` wants this key in the file"""
     blink_hz: Annotated[float, Meta(ge=0.5, le=5)] = 2.0
     """blinking of ALERT's red, flashes per second"""
     fault_blink_hz: Annotated[float, Meta(ge=0.25, le=5)] = 0.5
@@ -91,6 +92,17 @@ class FeedbackConfig(Section, frozen=True):
     gpio: GpioConfig = msgspec.field(default_factory=GpioConfig)
     usb: UsbConfig = msgspec.field(default_factory=UsbConfig)
     sound: SoundConfig = msgspec.field(default_factory=SoundConfig)
+
+
+class LampConfig(Section, frozen=True):
+    """The lamp's own process, where feedback.light is lamp."""
+
+    driver: Literal["gpio", "usb", "file"] | None = None
+    """what it drives, by feedback.gpio or feedback.usb; file: for tests; must be set"""
+    socket: Annotated[str, Meta(min_length=1, max_length=100)] = "/run/bikeped/lamp.socket"
+    """Unix socket on which it hears the service"""
+    file: str | None = None
+    """file that shows the colour in place of a lamp, for driver file"""
 
 
 class MqttConfig(Section, frozen=True):

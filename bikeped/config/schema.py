@@ -15,6 +15,7 @@ from msgspec import Meta
 from bikeped.config.output_sections import (
     AuditConfig,
     FeedbackConfig,
+    LampConfig,
     MqttConfig,
     Section,
     WebConfig,
@@ -255,6 +256,7 @@ class Config(Section, frozen=True):
     decision: DecisionConfig = msgspec.field(default_factory=DecisionConfig)
     monitor: MonitorConfig = msgspec.field(default_factory=MonitorConfig)
     feedback: FeedbackConfig = msgspec.field(default_factory=FeedbackConfig)
+    lamp: LampConfig = msgspec.field(default_factory=LampConfig)
     mqtt: MqttConfig = msgspec.field(default_factory=MqttConfig)
     web: WebConfig = msgspec.field(default_factory=WebConfig)
     audit: AuditConfig = msgspec.field(default_factory=AuditConfig)

@@ -9,43 +9,37 @@ and `python -m bikeped.feedback` (ExecStopPost) then darkens the light.
 
 from __future__ import annotations
 
-import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 from bikeped.errors import FeedbackError
 from bikeped.faults import Fault
 from bikeped.feedback.signal_logic import fault_signal
-from bikeped.types import Colour, Signal
+from bikeped.lamp.colours import Colour, Light
+from bikeped.types import Signal
 
 _log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-#: A GPIO line by name or offset, or a relay by number; None is not wired.
-Lamp = str | int | None
-
 #: The fault of a light that the service has not set for `watchdog_s`.
 NOT_REFRESHED = Fault("light", "light.not_refreshed", "not refreshed by the service")
 
-LAMP_COLOURS = (Colour.RED, Colour.ORANGE, Colour.GREEN, Colour.BLUE)
 
+class LightOutput(Protocol):
+    """What the service needs of its light: a thread that drives it, or the lamp's process."""
 
-class Light(Protocol):
-    """A light as a device: one colour at a time.
+    name: str  #: as in `feedback.light`
+    errors: int  #: device calls that failed, since the start
 
-    Both methods raise FeedbackError when the device does not obey; after that the light is closed
-    and opened anew.
-    """
-
-    def set(self, colour: Colour) -> None:
-        """Shows `colour` and nothing else; `Colour.OFF` is dark. May block."""
-
-    def close(self) -> None:
-        """Switches off and releases the device."""
+    @property
+    def fault(self) -> Fault | None: ...
+    def start(self) -> None: ...
+    def show(self, signal: Signal) -> None: ...
+    def close(self, timeout_s: float = 2.0) -> bool: ...
 
 
 class SimulatedLight:
@@ -67,29 +61,6 @@ class SimulatedLight:
         self.colour = self._lit = Colour.OFF
 
 
-def assign_lamps(wired: Mapping[Colour, Lamp], section: str) -> dict[Colour, Lamp]:
-    """Which lamp shows which colour, given the lamps that are wired; None is dark.
-
-    Without an orange lamp its signals (WARNING, FAULT) go to red, which never reassures; green and
-    blue fall back to dark. Raises FeedbackError, naming the configuration `section`, when red is
-    missing (no ALERT could be shown) or two colours share a lamp.
-    """
-    lamps = {colour: wired.get(colour) for colour in LAMP_COLOURS}
-    if lamps[Colour.RED] is None:
-        raise FeedbackError(
-            f"{section}: no red lamp is wired, so no ALERT could be shown; set the key of red"
-        )
-    for (one, lamp), (other, same) in itertools.combinations(lamps.items(), 2):
-        if lamp is not None and lamp == same:
-            raise FeedbackError(
-                f"{section}: {one.value} and {other.value} are both on {lamp!r}; give each "
-                "its own, or leave one out"
-            )
-    if lamps[Colour.ORANGE] is None:
-        lamps[Colour.ORANGE] = lamps[Colour.RED]
-    return {**lamps, Colour.OFF: None}
-
-
 class LightDriver:
     """Shows signals on a light, from its own thread, and reports when the light does not obey.
 
@@ -100,7 +71,7 @@ class LightDriver:
 
     hang_s = 2.0  #: a device call longer than this is a fault
     assert_s = 2.0  #: between two sendings of an unchanged colour: a replugged light is noticed
-    retry_s = (0.5, 30.0)  #: first and longest pause after an error; pauses double
+    retry_s = (0.5, 4.0)  #: first and longest pause after an error; pauses double
 
     def __init__(
         self,

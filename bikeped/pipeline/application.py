@@ -19,7 +19,7 @@ from bikeped.config.load import LoadedConfig
 from bikeped.cores import cores
 from bikeped.detection.detector import load_detector
 from bikeped.errors import DetectorError
-from bikeped.feedback.light import LightDriver
+from bikeped.feedback.light import LightOutput
 from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.feedback.speaker import Speaker
 from bikeped.pipeline.detection_scheduler import (
@@ -117,7 +117,7 @@ class Application:
         *,
         feed: Feed,
         source: str,
-        light: LightDriver,
+        light: LightOutput,
         mqtt: bool,
         pages: Pages | None = None,
         speaker: Speaker | None = None,

@@ -29,8 +29,8 @@ from bikeped.capture.source_names import shown_source
 from bikeped.config.load import LoadedConfig
 from bikeped.errors import BikepedError, CaptureError
 from bikeped.feedback import open_light
-from bikeped.feedback.light import LAMP_COLOURS
 from bikeped.feedback.sounds import make_wav
+from bikeped.lamp.colours import LAMP_COLOURS
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
 from bikeped.pipeline.application import load_detector_pool
 from bikeped.pipeline.detection_scheduler import DecodedFrame

@@ -18,8 +18,8 @@ from bikeped.capture.source_names import shown_source
 from bikeped.config.load import LoadedConfig
 from bikeped.config.provenance import check_provenance
 from bikeped.faults import Fault
-from bikeped.feedback import light_driver
-from bikeped.feedback.light import LightDriver
+from bikeped.feedback import light_output
+from bikeped.feedback.light import LightOutput
 from bikeped.feedback.signal_logic import fault_signal
 from bikeped.feedback.speaker import Speaker
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 #: Building an engine takes minutes; what takes longer than this has hung.
 LOAD_LIMIT_S = 1800.0
-_REFRESH_S = 0.25
+_REFRESH_S = 0.1  #: the lamp's process takes longer pauses for a fault
 LOADING = Fault("starting", "service.starting", "loading the model")
 
 
@@ -69,7 +69,7 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
     provenance = check_provenance(loaded)
     log.log(logging.INFO if provenance.holds else logging.WARNING, "%s", provenance.text)
     config, ground_mapper = loaded.config, GroundMapper(loaded)
-    light = light_driver(config.feedback)
+    light = light_output(config.feedback, config.lamp)
     async with contextlib.AsyncExitStack() as last, contextlib.AsyncExitStack() as stack:
         last.enter_context(claimed(loaded))
         light.start()  # shows FAULT until the first signal
@@ -137,7 +137,7 @@ def _open_camera(loaded: LoadedConfig) -> FrameSource:
 
 
 async def _load_while_alive(
-    loaded: LoadedConfig, light: LightDriver, stop: asyncio.Event
+    loaded: LoadedConfig, light: LightOutput, stop: asyncio.Event
 ) -> FrameDetector | None:
     """Loads the model in a thread (an engine may take minutes to build), showing FAULT meanwhile.
 
@@ -166,7 +166,7 @@ async def _refresh(dispatcher: SignalDispatcher) -> None:
         await asyncio.sleep(_REFRESH_S)
 
 
-async def _darken(light: LightDriver) -> None:
+async def _darken(light: LightOutput) -> None:
     if await asyncio.to_thread(light.close):
         log.info("stopped: the light is off")
     else:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from bikeped.faults import Fault, fault_texts
-from bikeped.feedback.light import LightDriver
+from bikeped.feedback.light import LightOutput
 from bikeped.feedback.signal_logic import OFF, SignalLogic
 from bikeped.feedback.speaker import Speaker
 from bikeped.pipeline.runtime import RateLimitedLogger
@@ -34,7 +34,7 @@ class SignalDispatcher:
     def __init__(
         self,
         logic: SignalLogic,
-        light: LightDriver | None = None,
+        light: LightOutput | None = None,
         speaker: Speaker | None = None,
         listeners: Sequence[SignalListener] = (),
     ) -> None:

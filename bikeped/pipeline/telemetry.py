@@ -14,7 +14,7 @@ from bikeped import __version__
 from bikeped.config.load import LoadedConfig
 from bikeped.decision.episodes import EpisodeTracker
 from bikeped.faults import Component, Fault, fault_texts
-from bikeped.feedback.light import LightDriver
+from bikeped.feedback.light import LightOutput
 from bikeped.log_queue import dropped_lines
 from bikeped.pipeline.loop import FrameResult, Loop
 from bikeped.pipeline.runtime import RateLimitedLogger
@@ -240,7 +240,7 @@ def _shown(signal: Signal) -> ShownState:
     return cast(ShownState, signal.name)
 
 
-async def report_health(telemetry: Telemetry, loop: Loop, light: LightDriver) -> None:
+async def report_health(telemetry: Telemetry, loop: Loop, light: LightOutput) -> None:
     """Reports health to broker, metrics and log until cancelled. An error costs one report."""
     limited_log = RateLimitedLogger(log)
     interval_s = telemetry.loaded.config.mqtt.health_interval_s

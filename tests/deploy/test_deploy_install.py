@@ -314,7 +314,7 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
 
 
 def test_udev_rules_match_what_the_code_drives() -> None:
-    from bikeped.feedback.usb import _DEVICES
+    from bikeped.lamp.usb import _DEVICES
 
     text = RULES.read_text()
     for _, vendor, product in _DEVICES.values():

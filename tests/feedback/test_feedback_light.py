@@ -12,7 +12,8 @@ from bikeped.config.output_sections import FeedbackConfig, GpioConfig, UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.faults import Fault
 from bikeped.feedback import check_light, light_driver, open_light
-from bikeped.feedback.light import LightDriver, SimulatedLight, assign_lamps
+from bikeped.feedback.light import LightDriver, SimulatedLight
+from bikeped.lamp.colours import assign_lamps
 from bikeped.types import Colour, Signal
 
 BLUE = Signal("IDLE", Colour.BLUE)

@@ -23,15 +23,23 @@ import errno
 import importlib
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
-from bikeped.config.output_sections import UsbConfig
 from bikeped.errors import FeedbackError
-from bikeped.feedback.light import LAMP_COLOURS, Lamp, assign_lamps
-from bikeped.types import Colour
+from bikeped.lamp.colours import LAMP_COLOURS, Colour, Lamp, assign_lamps
 
 SECTION = "feedback.usb"
 TIMEOUT_MS = 300
+
+
+class UsbWiring(Protocol):
+    """What `feedback.usb` says, without the configuration's classes; also `relay_<colour>`."""
+
+    @property
+    def device(self) -> str: ...
+    @property
+    def serial(self) -> str | None: ...
+
 
 _INTERFACE = 0
 _SET_REPORT, _GET_REPORT = 0x09, 0x01
@@ -55,7 +63,7 @@ _DEVICES = {
 }
 
 
-def relay_lamps(config: UsbConfig) -> dict[Colour, Lamp]:
+def relay_lamps(config: UsbWiring) -> dict[Colour, Lamp]:
     """The relay of each colour, 1 to 8, None for dark; FeedbackError when red is not wired."""
     wired = {c: getattr(config, f"relay_{c.value}") or None for c in LAMP_COLOURS}
     return assign_lamps(wired, SECTION)
@@ -67,17 +75,18 @@ class UsbLight:
     `backend` takes a pyusb backend in place of libusb (tests).
     """
 
-    def __init__(self, config: UsbConfig, *, backend: Any = None) -> None:
+    def __init__(self, config: UsbWiring, *, backend: Any = None) -> None:
         name, vendor, product = _DEVICES[config.device]
         self._name = f"{name} {vendor:04x}:{product:04x}"
         self._core, self._util = _load_pyusb()
         lamps = relay_lamps(config) if config.device == "relay" else {}
+        self._relays = {colour: lamp for colour, lamp in lamps.items() if isinstance(lamp, int)}
         with self._errors("cannot be opened"):
             self._device = self._find(config, backend)
             try:
                 _detach(self._device)
                 self._util.claim_interface(self._device, _INTERFACE)
-                self._show = self._protocol(config, lamps)
+                self._show = self._protocol(config)
             except BaseException:
                 self._util.dispose_resources(self._device)
                 raise
@@ -87,6 +96,15 @@ class UsbLight:
         with self._errors(f"{colour.value} cannot be set"):
             self._show(colour)
 
+    def mismatch(self, colour: Colour) -> str | None:
+        """Which relays are on instead of `colour`'s; None where they agree or cannot be read."""
+        if not self._relays:
+            return None
+        with self._errors("cannot be read back"):
+            on = _closed_relays(self._device) & set(self._relays.values())
+        wanted = {self._relays[colour]} if colour in self._relays else set()
+        return None if on == wanted else f"the relays {sorted(on)} are on"
+
     def close(self) -> None:
         """Switches off and releases the device."""
         try:
@@ -94,7 +112,7 @@ class UsbLight:
         finally:
             self._util.dispose_resources(self._device)
 
-    def _find(self, config: UsbConfig, backend: Any) -> Any:
+    def _find(self, config: UsbWiring, backend: Any) -> Any:
         """The one device that fits kind and serial number."""
         _, vendor, product = _DEVICES[config.device]
         other_devices: list[str] = []
@@ -118,14 +136,14 @@ class UsbLight:
         others = f" (found {', '.join(other_devices)})" if other_devices else ""
         raise FeedbackError(f"{SECTION}.device: no {wanted} is plugged in{others}")
 
-    def _serial(self, config: UsbConfig, device: Any) -> str:
+    def _serial(self, config: UsbWiring, device: Any) -> str:
         if config.device != "relay":
             return str(device.serial_number)
         # The board's USB serial number is the same on all of them; its own is in the report.
         _detach(device)
         return _relay_report(device)[:5].rstrip(b"\0").decode("ascii", "replace")
 
-    def _protocol(self, config: UsbConfig, lamps: dict[Colour, Lamp]) -> Callable[[Colour], object]:
+    def _protocol(self, config: UsbWiring) -> Callable[[Colour], object]:
         """What shows a colour on this kind of device."""
         device = self._device
         if config.device == "blink1":
@@ -137,8 +155,7 @@ class UsbLight:
             return lambda colour: device.write(
                 endpoint, bytes([0x01, 0xFF, *_RGB[colour], 0, 0, 0]), TIMEOUT_MS
             )
-        relays = {colour: lamp for colour, lamp in lamps.items() if isinstance(lamp, int)}
-        return partial(_show_by_relays, device, relays)
+        return partial(_show_by_relays, device, self._relays)
 
     def _out_endpoint(self) -> int:
         interface = self._device.get_active_configuration()[(_INTERFACE, 0)]

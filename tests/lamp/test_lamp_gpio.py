@@ -12,7 +12,7 @@ import pytest
 
 from bikeped.config.output_sections import GpioConfig
 from bikeped.errors import FeedbackError
-from bikeped.feedback.gpio import GpioLight
+from bikeped.lamp.gpio import GpioLight
 from bikeped.types import Colour
 
 FOUR = GpioConfig(red="PQ.05", orange=106, green="PN.01", blue="PAC.06")

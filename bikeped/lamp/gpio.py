@@ -11,17 +11,24 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from bikeped.config.output_sections import GpioConfig
 from bikeped.errors import FeedbackError
-from bikeped.feedback.light import LAMP_COLOURS, Lamp, assign_lamps
-from bikeped.types import Colour
+from bikeped.lamp.colours import LAMP_COLOURS, Colour, Lamp, assign_lamps
 
 SECTION = "feedback.gpio"
 
 
-def gpio_lamps(config: GpioConfig) -> dict[Colour, Lamp]:
+class GpioWiring(Protocol):
+    """What `feedback.gpio` says; the lamp's process has it without the configuration's classes."""
+
+    @property
+    def chip(self) -> str: ...
+    @property
+    def active_low(self) -> bool: ...
+
+
+def gpio_lamps(config: GpioWiring) -> dict[Colour, Lamp]:
     """The line of each colour; raises FeedbackError when the wiring cannot show what it must."""
     return assign_lamps({c: getattr(config, c.value) for c in LAMP_COLOURS}, SECTION)
 
@@ -35,7 +42,7 @@ class GpioLight:
     """
 
     def __init__(
-        self, config: GpioConfig, *, gpiod: Any = None, chips: Iterable[str] | None = None
+        self, config: GpioWiring, *, gpiod: Any = None, chips: Iterable[str] | None = None
     ) -> None:
         self._lamps = gpio_lamps(config)
         self._gpiod = _load_gpiod() if gpiod is None else gpiod
@@ -73,6 +80,18 @@ class GpioLight:
                 self._request.set_values({lamp: self._active})
         except (OSError, ValueError) as error:
             raise FeedbackError(f"{SECTION}: {colour.value} cannot be set: {error}") from error
+
+    def mismatch(self, colour: Colour) -> str | None:
+        """What the lines read back instead of `colour`; None where they agree."""
+        try:
+            values = self._request.get_values(self._lines)
+        except (OSError, ValueError) as error:
+            raise FeedbackError(f"{SECTION}: the lines cannot be read: {error}") from error
+        lit = [
+            line for line, value in zip(self._lines, values, strict=True) if value == self._active
+        ]
+        lamp = self._lamps[colour]
+        return None if lit == ([] if lamp is None else [lamp]) else f"the lines {lit} are lit"
 
     def close(self) -> None:
         """Switches all lamps off and gives the lines back to the kernel."""

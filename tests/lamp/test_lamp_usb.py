@@ -13,8 +13,8 @@ import usb.core
 
 from bikeped.config.output_sections import UsbConfig
 from bikeped.errors import FeedbackError
-from bikeped.feedback import usb as lights
-from bikeped.feedback.usb import UsbLight
+from bikeped.lamp import usb as lights
+from bikeped.lamp.usb import UsbLight
 from bikeped.types import Colour
 
 IDS = {"blink1": (0x27B8, 0x01ED), "luxafor": (0x04D8, 0xF372), "relay": (0x16C0, 0x05DF)}
