@@ -34,7 +34,7 @@ def check(config_path: Path | None, overrides: tuple[str, ...], json_path: str |
     frame = framing(loaded)
     camera = ground_camera(loaded)
     GroundTable(camera, *frame.crop_wh, step_px=64)
-    check_light(loaded.config.feedback)
+    check_light(loaded.config.feedback, loaded.config.lamp)
     model = loaded.config.detection.model
     file = None if model is None else model_file(model, loaded.base_dir)
     if file is not None and not file.is_file():

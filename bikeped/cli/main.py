@@ -14,6 +14,7 @@ from bikeped.errors import EXTRAS, BikepedError, MissingPackageError
 #: the device imports nothing of the lab.
 COMMANDS = {
     "run": ("bikeped.cli.run:run", "Run the service: camera, tracking, decision, light and sound."),
+    "lamp": ("bikeped.cli.lamp", "Drive the lamp in a process of its own; end what it latched."),
     "replay": ("bikeped.cli.run:replay", "Run a recorded video through the service's loop."),
     "demo": ("bikeped.lab.cli.demo", "Draw a crossing and run it through the loop."),
     "config": ("bikeped.cli.config", "Check, show or describe the configuration."),

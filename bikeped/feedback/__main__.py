@@ -35,7 +35,9 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         data = read_regular(Path(arguments[0]))
-        open_light(msgspec.yaml.decode(data, type=_FeedbackOnly).feedback).close()
+        feedback = msgspec.yaml.decode(data, type=_FeedbackOnly).feedback
+        if feedback.light != "lamp":  # whose process shows FAULT by itself
+            open_light(feedback).close()
     except BikepedError as error:
         sys.stderr.write(f"{error}\n")
         return error.exit_status

@@ -79,15 +79,18 @@ class LampClient:
         return Fault("light", "light.error", str(error)) if error else None
 
     def close(self, timeout_s: float = 2.0) -> bool:
-        """Ends the heartbeats: the lamp stays dark after OFF, and shows FAULT after all else."""
+        """Ends the heartbeats: the lamp stays dark after OFF, and shows FAULT after all else.
+
+        False when the lamp's process does not answer or obey.
+        """
         if self._off:
             self.show(OFF)
         self._hear(self._clock())
-        dark = self._off and self.fault is None
+        works = self.fault is None
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-        return dark
+        return works
 
 
 def open_socket() -> socket.socket:

@@ -105,6 +105,7 @@ class LightDriver:
         self._retry_at_s: float | None = None
         self._pause_s = self.retry_s[0]
         self._tripped = False
+        self._to_say = (False, False)  # whether the watchdog has tripped, and had before
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -160,7 +161,14 @@ class LightDriver:
             self._pattern = _pattern_of(signal)
             self._pattern_s = now_s
         colour, edge_s = _phase(self._pattern, self._pattern_s, now_s)
-        return min(edge_s, trips_at_s, self._apply(colour, now_s))
+        due_s = min(edge_s, trips_at_s, self._apply(colour, now_s))
+        # Said once the light is set, and outside the lock: a log that blocks must block neither.
+        tripped, before = self._to_say
+        if tripped and not before:
+            _log.error("%s for %g s; the light shows FAULT", NOT_REFRESHED, self._watchdog_s)
+        elif before and not tripped:
+            _log.warning("light: refreshed again after its watchdog had tripped")
+        return due_s
 
     def _effective(self, now_s: float) -> tuple[Signal, float]:
         """The signal that counts at `now_s`, and when the watchdog would trip."""
@@ -168,11 +176,7 @@ class LightDriver:
             signal, shown_s = self._signal, self._shown_s
             stale = now_s - shown_s >= self._watchdog_s
             was, self._tripped = self._tripped, stale and signal is not None
-        # Logged outside the lock: a log that blocks must not block `show`.
-        if self._tripped and not was:
-            _log.error("%s for %g s; the light shows FAULT", NOT_REFRESHED, self._watchdog_s)
-        elif was and not self._tripped:
-            _log.warning("light: refreshed again after its watchdog had tripped")
+        self._to_say = (self._tripped, was)
         if stale or signal is None:
             return self._watchdog_signal, float("inf")
         return signal, shown_s + self._watchdog_s

@@ -29,6 +29,7 @@ from bikeped.capture.source_names import shown_source
 from bikeped.config.load import LoadedConfig
 from bikeped.errors import BikepedError, CaptureError
 from bikeped.feedback import open_light
+from bikeped.feedback.lamp_client import ask_lamp
 from bikeped.feedback.sounds import make_wav
 from bikeped.lamp.colours import LAMP_COLOURS
 from bikeped.models import BUNDLED, NOT_FOR_STREETS
@@ -192,6 +193,8 @@ def check_light(loaded: LoadedConfig) -> Finding:
     """Shows every colour briefly, then darkens the light."""
     feedback = loaded.config.feedback
     try:
+        if feedback.light == "lamp":  # which owns the lines and lets nobody else drive them
+            return _check_lamp(loaded.config.lamp.socket)
         with contextlib.closing(open_light(feedback)) as light:
             for colour in LAMP_COLOURS:
                 light.set(colour)
@@ -202,6 +205,16 @@ def check_light(loaded: LoadedConfig) -> Finding:
         return Finding("warn", "simulated: no lamp is connected", "set feedback.light")
     names = ", ".join(colour.value for colour in LAMP_COLOURS)
     return Finding("ok", f"{feedback.light} answers; did you see {names}, then dark?")
+
+
+def _check_lamp(path: str) -> Finding:
+    status = ask_lamp(path, {"status": True})
+    if status.get("error"):
+        return Finding("fail", f"lamp: {status['error']}", "journalctl -u bikeped-lamp")
+    if status.get("latched"):
+        remedy = "find the cause, then: bikeped lamp reset"
+        return Finding("fail", f"lamp: {status['latched']}", remedy)
+    return Finding("ok", f"the lamp's process answers and shows {status.get('colour')}")
 
 
 def check_speaker(loaded: LoadedConfig) -> Finding:

@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 #: Building an engine takes minutes; what takes longer than this has hung.
 LOAD_LIMIT_S = 1800.0
 _REFRESH_S = 0.1  #: the lamp's process takes longer pauses for a fault
+_ENDING = (signals.SIGUSR1, signals.SIGUSR2, signals.SIGALRM, signals.SIGQUIT)
 LOADING = Fault("starting", "service.starting", "loading the model")
 
 
@@ -55,8 +56,12 @@ def run_service(
 
 async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Pages | None) -> int:
     stop = asyncio.Event()
-    for number in (signals.SIGTERM, signals.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    events = asyncio.get_running_loop()
+    # Any of them would end the process with the last light on. Nothing can be loaded anew: HUP is
+    # ignored.
+    for number in (*_ENDING, signals.SIGTERM, signals.SIGINT):
+        events.add_signal_handler(number, stop.set)
+    events.add_signal_handler(signals.SIGHUP, log.info, "SIGHUP is ignored: restart the service")
     log.info(
         "bikeped %s, Python %s, %s; configuration %s (%s), calibration %s",
         __version__,
@@ -167,7 +172,10 @@ async def _refresh(dispatcher: SignalDispatcher) -> None:
 
 
 async def _darken(light: LightOutput) -> None:
-    if await asyncio.to_thread(light.close):
+    answers = await asyncio.to_thread(light.close)
+    if answers and light.name == "lamp":
+        log.info("stopped: the lamp's process goes on, dark after a stop and in FAULT otherwise")
+    elif answers:
         log.info("stopped: the light is off")
     else:
         log.error("stopped, but the light does not answer and may still be on")

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import pytest
 
-from bikeped.config.output_sections import FeedbackConfig, GpioConfig, UsbConfig
+from bikeped.config.output_sections import FeedbackConfig, GpioConfig, LampConfig, UsbConfig
 from bikeped.errors import FeedbackError
 from bikeped.faults import Fault
-from bikeped.feedback import check_light, light_driver, open_light
+from bikeped.feedback import check_light, light_output, open_light
 from bikeped.feedback.light import LightDriver, SimulatedLight
 from bikeped.lamp.colours import assign_lamps
 from bikeped.types import Colour, Signal
@@ -207,8 +207,8 @@ def test_the_threads_watchdog_needs_no_help_from_the_loop(caplog: pytest.LogCapt
     driver.show(GREEN)
     light.wait_for(lambda: Colour.GREEN in light.calls)
     light.wait_for(lambda: light.calls.count(Colour.ORANGE) >= 2)
-    assert caplog.text.count("not refreshed") == 1
     driver.close(WAIT_S)
+    assert caplog.text.count("not refreshed") == 1
 
 
 def test_a_hanging_device_blocks_nobody_and_is_a_fault() -> None:
@@ -311,8 +311,9 @@ def test_factories_check_the_wiring_before_any_device() -> None:
         FeedbackConfig(light="usb", usb=UsbConfig(relay_green=1)),
     ):
         with pytest.raises(FeedbackError, match=r"feedback\.(gpio|usb)"):
-            check_light(bad)
+            check_light(bad, LampConfig())
         with pytest.raises(FeedbackError, match=r"feedback\.(gpio|usb)"):
-            light_driver(bad)
+            light_output(bad, LampConfig())
     assert isinstance(open_light(FeedbackConfig()), SimulatedLight)
-    check_light(FeedbackConfig(light="usb", usb=UsbConfig(device="blink1", relay_red=0)))
+    blink1 = FeedbackConfig(light="usb", usb=UsbConfig(device="blink1", relay_red=0))
+    check_light(blink1, LampConfig())
