@@ -122,7 +122,6 @@ FAULT_KINDS: dict[str, FaultKind] = {
             severity=Severity.CRITICAL,
             clears=Clears.RESTART,
         ),
-        _minor("camera.moved_slightly", "camera", "The camera has moved a little; align it again."),
         _stops(
             "light.mismatch",
             "light",
@@ -134,6 +133,7 @@ FAULT_KINDS: dict[str, FaultKind] = {
             "Heartbeats came and went; the lamp shows FAULT until `bikeped lamp reset`.",
         ),
         _stops("lamp.silent", "light", "The lamp's process does not answer."),
+        _minor("camera.moved_slightly", "camera", "The camera has moved a little; align it again."),
         _minor("speaker.error", "speaker", "A sound could not be played."),
         _minor("audit.error", "audit", "The audit log cannot be written."),
     )

@@ -24,9 +24,13 @@ def check_runnable(loaded: LoadedConfig) -> None:
     """ConfigError with one line for what the service must not be started with."""
     config = loaded.config
     needed = ["camera.source", "feedback.light"]
-    if config.feedback.light == "gpio":
+    driver: str = config.feedback.light
+    if driver == "lamp":
+        needed.append("lamp.driver")
+        driver = config.lamp.driver or driver
+    if driver == "gpio":
         needed.append("feedback.gpio.chip")
-    elif config.feedback.light == "usb":
+    elif driver == "usb":
         needed.append("feedback.usb.device")
     for key in needed:
         if key not in loaded.named:
