@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 import time
 from collections.abc import Collection
 from pathlib import Path
 
 REASSURING = ("green", "blue")
+#: In the order in which one is named when several are lit.
+COLOURS = ("green", "blue", "red", "orange")
 
 
 class LightTimeline:
@@ -61,3 +64,31 @@ class LightTimeline:
     def count(self, colours: Collection[str], from_s: float, to_s: float) -> int:
         """How often one of `colours` began to show between two times."""
         return sum(colour in colours and from_s <= at_s <= to_s for at_s, colour in self.changes())
+
+
+class FileWatch:
+    """Notes the changes of the lamp process's file with their times, for `LightTimeline`."""
+
+    def __init__(self, state: Path, timeline: Path) -> None:
+        self._state, self._timeline = state, timeline
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        before = ""
+        with self._timeline.open("a") as timeline:
+            while not self._ends.wait(0.004):
+                try:
+                    lit = self._state.read_text().split()[0].split("+")
+                except (OSError, IndexError):
+                    continue
+                colour = next((name for name in COLOURS if name in lit), "off")
+                if colour != before:
+                    timeline.write(f"{time.monotonic():.4f} {colour}\n")
+                    timeline.flush()
+                    before = colour
+
+    def close(self) -> None:
+        self._ends.set()
+        self._thread.join()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import os
 import re
@@ -25,7 +26,7 @@ from typing import Any
 from small_crossing import MOSQUITTO, PATIENCE_S, Broker, Service, write_config, write_model
 
 from campaign.camera import LoopbackCamera
-from campaign.light import REASSURING, LightTimeline
+from campaign.light import REASSURING, FileWatch, LightTimeline
 from campaign.registry import Result, Row, Skip
 
 ROOT = Path(__file__).parents[2]
@@ -47,6 +48,7 @@ class Rig:
         self._stack = contextlib.ExitStack()
         self._camera: LoopbackCamera | None = None
         self._model: Path | None = None
+        self._lamp_started = False
 
     # --- what it records
 
@@ -94,6 +96,40 @@ class Rig:
         return write_config(
             self.folder / name, source or self.camera.address, self.model, more, picture=True
         )
+
+    def lamp_config(self, more: str = WEB) -> Path:
+        """A configuration whose light is a process of its own, which is started, too.
+
+        Its file keeps the lamps' state; a thread notes every change with its time. Where bikeped
+        has no such process, the light is the service's own.
+        """
+        if importlib.util.find_spec("bikeped.feedback.lamp") is None:
+            return self.config(more)
+        state = self.folder / "lamps"
+        lamp = (
+            f"feedback: {{light: lamp}}\nlamp: {{driver: file, file: {state}, "
+            f"socket: {self.folder}/socket, settings: {self.folder}/lamp.json}}\n"
+        )
+        config = self.config(more + lamp)
+        if not self._lamp_started:
+            self._lamp_started = True
+            process = self.popen("lamp", "run", "-c", config)
+            watch = FileWatch(state, self.light.path)
+            self._stack.callback(watch.close)
+            self._stack.callback(process.kill)
+        return config
+
+    def popen(self, *arguments: object, **options: Any) -> subprocess.Popen[bytes]:
+        """Starts a command of bikeped; its output goes into a file unless `options` say so."""
+        with (self.folder / f"{arguments[0]}.log").open("ab") as log:
+            process = subprocess.Popen(
+                [*LAUNCH, "bikeped.cli.main", *map(str, arguments)],
+                env={**os.environ, **self.environment()},
+                cwd=self.folder,
+                **{"stdout": log, "stderr": log, **options},
+            )
+        self._stack.callback(process.kill)
+        return process
 
     def control(self, text: str = "") -> float:
         """Tells the seam inside the service what to do; returns the time."""
@@ -237,13 +273,24 @@ class Supervisor:
         )
         self._pause_s = float(_last(unit, "RestartSec").removesuffix("s"))
         self._watchdog_s = float(_last(unit, "WatchdogSec").removesuffix("s"))
+        self._abort_s = float(_last(unit, "TimeoutAbortSec").removesuffix("s"))
         self.log = folder / "service.log"
+        self.began_s = time.monotonic()
         self.starts: list[float] = []
         self.ends: list[tuple[float, int]] = []
         self.process: subprocess.Popen[bytes] | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
+
+    def next_start(self, since_s: float) -> float:
+        """Waits for the first start after `since_s`; returns its time, infinite after WAIT_S."""
+        while time.monotonic() - since_s < WAIT_S:
+            for at_s in list(self.starts):
+                if at_s > since_s:
+                    return at_s
+            time.sleep(0.02)
+        return float("inf")
 
     def _command(self, line: str) -> Sequence[str]:
         """A line of the unit with this machine's paths, run through `campaign.launch`."""
@@ -281,7 +328,7 @@ class Supervisor:
             if watched and time.monotonic() - heard_s > self._watchdog_s:
                 self.process.send_signal(signal.SIGABRT)
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    self.process.wait(1.0)
+                    self.process.wait(self._abort_s)
                 self.process.kill()
         if self._closing.is_set():
             self.process.kill()
