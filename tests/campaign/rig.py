@@ -92,7 +92,10 @@ class Rig:
         return self._model
 
     def config(self, more: str = WEB, source: str | None = None, name: str = "pole.yaml") -> Path:
-        """A configuration of the small camera; `source` None is the loopback camera."""
+        """A whole configuration of the small camera; `source` None is the loopback camera."""
+        if "feedback:" not in more:
+            more += "feedback: {light: simulated}\n"
+        more = more.replace("complete: true\n", "") + "complete: true\n"
         return write_config(
             self.folder / name, source or self.camera.address, self.model, more, picture=True
         )
@@ -227,8 +230,10 @@ class Running(Service):
 
     def settle(self, wait_s: float = WAIT_S) -> float:
         """Waits until the light reassures; returns the seconds since the start."""
-        delay_s = self.light.until(REASSURING, self.began_s, wait_s)
-        if delay_s > wait_s:
+        # A light that keeps its colour may show the last service's: FAULT comes first.
+        delay_s = self.light.until(("orange",), self.began_s, wait_s)
+        delay_s += self.light.until(REASSURING, self.began_s + min(delay_s, wait_s), wait_s)
+        if delay_s > 2 * wait_s:
             raise RuntimeError(f"the service did not come up:\n{self.log[-3000:]}")
         return delay_s
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from bikeped.capture.cameras import NetworkSource
 from bikeped.detection.detector import DetectionResult, Detector
-from bikeped.errors import DetectorError
-from bikeped.types import Detections, Frame, ImageArray
+from bikeped.errors import DetectorError, FeedbackError
+from bikeped.feedback.light import SimulatedLight
+from bikeped.types import Colour, Detections, Frame, ImageArray
 
 
 def control() -> tuple[str, float]:
@@ -76,6 +77,24 @@ def detector() -> None:
         return result
 
     Detector.infer = faulty  # type: ignore[method-assign]
+
+
+def wall_clock() -> None:
+    """`jump` of so many seconds, as `time.time` shows it."""
+    now = time.time
+    time.time = lambda: now() + (control()[1] if control()[0] == "jump" else 0.0)
+
+
+def light() -> None:
+    """The light's device: `unplugged`."""
+    switch = SimulatedLight.set
+
+    def faulty(self: SimulatedLight, colour: Colour) -> None:
+        if control()[0] == "unplugged":
+            raise FeedbackError("campaign: unplugged")
+        switch(self, colour)
+
+    SimulatedLight.set = faulty  # type: ignore[method-assign]
 
 
 def interpreter() -> None:
