@@ -128,7 +128,6 @@ def full_disk(rig: Rig) -> None:
     "power cut while logs are written: 2,084 zero bytes at the end of audit.jsonl",
     "cut to the last whole record, and named",
     "lines that cannot be read = 0",
-    in_tests=True,
 )
 def zero_tail(rig: Rig) -> None:
     audit = rig.folder / "audit.jsonl"

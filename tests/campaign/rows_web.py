@@ -27,13 +27,7 @@ def _ask(
         return answer.status, answer.read(100_000)
 
 
-@row(
-    41,
-    "a foreign Host, Origin or rebinding, for every page and WebSocket",
-    "403",
-    "let in = 0",
-    in_tests=True,
-)
+@row(41, "a foreign Host, Origin or rebinding, for every page and WebSocket", "403", "let in = 0")
 def foreign(rig: Rig) -> None:
     service = rig.start()
     service.until_said("serving http")
@@ -63,7 +57,6 @@ def foreign(rig: Rig) -> None:
     "path traversal, a script as a name, bodies of 100 MB with and without a length",
     "refused, escaped; 413",
     "leaks = 0; not 413 = 0",
-    in_tests=True,
 )
 def hostile_requests(rig: Rig) -> None:
     secret = rig.folder / "secret.txt"
