@@ -106,6 +106,13 @@ FAULT_KINDS: dict[str, FaultKind] = {
         ),
         _begins("service.starting", "service", "The model loads, or the first frames are due."),
         _begins("service.recovering", "service", "A fault is over; good frames are counted."),
+        _withholds("service.unsteady", "service", "The service ended soon after its start before."),
+        _minor(
+            "service.last_good_config",
+            "service",
+            "The configuration is broken; the last good one runs.",
+            severity=Severity.ERROR,
+        ),
         _stops(
             "light.not_refreshed",
             "light",

@@ -101,12 +101,27 @@ def write_like(path: Path, content: bytes, like: Path) -> None:
     with _named(path, "written", "do it as a user who may write there"):
         status = like.stat()
         with WholeFile(path, status.st_mode & 0o7777) as partial:
-            with partial.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            write_synced(partial, content)
             with contextlib.suppress(PermissionError):  # only root may change the owner
                 os.chown(partial, status.st_uid, status.st_gid)
+
+
+def write_synced(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """Writes bytes and waits until they are on the disk. Raises OSError."""
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    path.chmod(mode)
+
+
+def sync_folder(folder: Path) -> None:
+    """Waits until the names in a folder are on the disk. Raises OSError."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def make_folder(folder: Path, option: str = "--out") -> None:

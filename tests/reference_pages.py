@@ -80,7 +80,8 @@ at the working directory; `~` is the home directory.
 
 **Whole files.** The last line of a file is `complete: true`. A file that was cut off, by a full
 disk or a loss of power, lacks it: `bikeped config check` and `bikeped run` warn of a file without
-it. `bikeped run` wants `camera.source` and `feedback.light` in the file, and `feedback.gpio.chip`
+it, and where the last good copy had it (`bikeped run --last-good`) such a file is not used.
+`bikeped run` wants `camera.source` and `feedback.light` in the file, and `feedback.gpio.chip`
 or `feedback.usb.device` beside them: what drives hardware has no silent default.
 
 **Numbers.** YAML reads `1e-3` as text: write `0.001`.

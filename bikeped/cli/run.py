@@ -22,8 +22,9 @@ from bikeped.cli.common import (
     write_json,
 )
 from bikeped.cli.guard import check_outputs, guarded
-from bikeped.config.load import load_config
-from bikeped.config.runnable import check_runnable, warnings
+from bikeped.config.last_good import load_runnable
+from bikeped.config.load import LoadedConfig, default_config_path, load_config
+from bikeped.config.runnable import warnings
 from bikeped.files import make_folder
 from bikeped.log_queue import log_through_queue
 
@@ -37,23 +38,36 @@ log = logging.getLogger(__name__)
 
 @click.command("run")
 @config_options
-def run(config_path: Path | None, overrides: tuple[str, ...]) -> NoReturn:
+@click.option(
+    "--last-good",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Keep a configuration that runs well in DIR and run that one where the file is broken.",
+)
+def run(config_path: Path | None, overrides: tuple[str, ...], last_good: Path | None) -> NoReturn:
     """Run the service until SIGTERM: camera, detection, tracking, decision, light and sound."""
     from bikeped.pipeline.run import run_service
+    from bikeped.pipeline.service_start import PLAIN_START, ServiceStart, start_on_pole
 
     root = logging.getLogger()
     root.setLevel(min(root.level, logging.INFO))
     log_through_queue()
-    loaded = load_config(config_path, overrides)
-    check_runnable(loaded)
-    for text in warnings(loaded):
-        log.warning("%s: %s", loaded.source, text)
-    pages = None
-    if loaded.config.web.enabled:  # else without the time and memory of its imports
-        from bikeped.web.service_pages import ServicePages
 
-        pages = ServicePages(loaded)
-    status = run_service(loaded, pages=pages)
+    def serve(loaded: LoadedConfig, start: ServiceStart) -> int:
+        for text in warnings(loaded):
+            log.warning("%s: %s", loaded.source, text)
+        pages = None
+        if loaded.config.web.enabled:  # else without the time and memory of its imports
+            from bikeped.web.service_pages import ServicePages
+
+            pages = ServicePages(loaded)
+        return run_service(loaded, pages=pages, start=start)
+
+    path = config_path or default_config_path()
+    if last_good is None:
+        status = serve(load_runnable(path, overrides), PLAIN_START)
+    else:
+        status = start_on_pole(path, overrides, last_good, serve)
     # Everything is stopped and the light is dark. A thread that hangs in a driver must not keep the
     # process alive: exit without joining it.
     logging.shutdown()

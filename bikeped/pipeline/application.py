@@ -19,6 +19,7 @@ from bikeped.config.load import LoadedConfig
 from bikeped.cores import cores
 from bikeped.detection.detector import load_detector
 from bikeped.errors import DetectorError
+from bikeped.faults import Fault
 from bikeped.feedback.light import LightOutput
 from bikeped.feedback.signal_logic import SignalLogic
 from bikeped.feedback.speaker import Speaker
@@ -125,6 +126,7 @@ class Application:
         outputs: Sequence[FrameResultListener] = (),
         view_width: int = 0,
         limits: Limits = DEFAULT_LIMITS,
+        fault_sources: Sequence[Callable[[], Fault | None]] = (),
         on_tick: Callable[[], None] = lambda: None,
         latency_frames: int = 900,
     ) -> None:
@@ -157,6 +159,7 @@ class Application:
             limits=limits,
             on_tick=on_tick,
             fault_sources=(
+                *fault_sources,
                 lambda: None if speaker is None else speaker.fault,
                 lambda: None if audit is None else audit.fault,
                 lambda: light.fault,

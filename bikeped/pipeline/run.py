@@ -28,10 +28,12 @@ from bikeped.pipeline.detection_scheduler import FrameDetector
 from bikeped.pipeline.fault_monitor import Limits, StageHangError
 from bikeped.pipeline.feed import LiveFeed
 from bikeped.pipeline.runtime import WorkerThread, notify
+from bikeped.pipeline.service_start import PLAIN_START, ServiceStart
 from bikeped.pipeline.signal_dispatcher import SignalDispatcher
 from bikeped.pipeline.single_instance import claimed
 from bikeped.pipeline.track_and_decide import GroundMapper, TrackAndDecide
 from bikeped.telemetry.event_files import AuditLog
+from bikeped.types import Signal
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +45,11 @@ LOADING = Fault("starting", "service.starting", "loading the model")
 
 
 def run_service(
-    loaded: LoadedConfig, *, detector: FrameDetector | None = None, pages: Pages | None = None
+    loaded: LoadedConfig,
+    *,
+    detector: FrameDetector | None = None,
+    pages: Pages | None = None,
+    start: ServiceStart = PLAIN_START,
 ) -> int:
     """Runs until SIGTERM or SIGINT; returns the exit status: 0, or that of the fault that ended it.
 
@@ -51,10 +57,12 @@ def run_service(
     that hangs is left behind, so the caller should end the process without joining threads (see
     `bikeped.cli.run`).
     """
-    return asyncio.run(_run(loaded, detector, pages))
+    return asyncio.run(_run(loaded, detector, pages, start))
 
 
-async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Pages | None) -> int:
+async def _run(
+    loaded: LoadedConfig, detector: FrameDetector | None, pages: Pages | None, start: ServiceStart
+) -> int:
     stop = asyncio.Event()
     events = asyncio.get_running_loop()
     # Any of them would end the process with the last light on. Nothing can be loaded anew: HUP is
@@ -79,10 +87,13 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
         last.enter_context(claimed(loaded))
         light.start()  # shows FAULT until the first signal
         last.push_async_callback(_darken, light)  # done last, whatever ends the service
+        if start.fault_s:
+            reason = fault_signal((start.reason or LOADING,), config.feedback.fault_blink_hz)
+            await _show_for(start.fault_s, light, reason, stop)
         if detector is None:
             detector = await _load_while_alive(loaded, light, stop)
         if detector is None:
-            return 0
+            return _ended(start)
         log.info("detector: %s, sha256 %s", detector.name, detector.model_hash or "none")
         if config.detection.model == BUNDLED:
             log.warning("detection.model: %s", NOT_FOR_STREETS)
@@ -116,11 +127,14 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
                 stale_after_s, config.detection.silent_after_s, config.detection.hang_after_s
             ),
             on_tick=partial(notify, "WATCHDOG=1"),
+            fault_sources=start.fault_sources(),
         )
         camera.start()
         await application.serve_pages()
         application.loop.stopping = stop  # which may be set already
         notify("READY=1", f"STATUS=watching {shown_source(config.camera.source)}")
+        watching = asyncio.create_task(start.watch(lambda: application.dispatcher.shown))
+        last.callback(watching.cancel)
         try:
             await application.run()
         except StageHangError as hang:
@@ -132,7 +146,26 @@ async def _run(loaded: LoadedConfig, detector: FrameDetector | None, pages: Page
             # Stopping the rest may take seconds: keeps the light's watchdog from tripping.
             last.callback(asyncio.create_task(_refresh(application.dispatcher)).cancel)
             log.info("latency\n%s", application.telemetry.times.table())
-        return 0
+        return _ended(start)
+
+
+def _ended(start: ServiceStart) -> int:
+    """The exit status of an end that was asked for."""
+    if start.on_steady is not None:
+        start.on_steady()
+    return 0
+
+
+async def _show_for(
+    seconds: float, light: LightOutput, signal: Signal, stop: asyncio.Event
+) -> None:
+    """Shows one signal for so long, or until the service is stopped."""
+    until_s = time.monotonic() + seconds
+    while time.monotonic() < until_s and not stop.is_set():
+        light.show(signal)
+        notify("EXTEND_TIMEOUT_USEC=30000000", "WATCHDOG=1", "STATUS=waiting in FAULT")
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(stop.wait(), _REFRESH_S)
 
 
 def _open_camera(loaded: LoadedConfig) -> FrameSource:

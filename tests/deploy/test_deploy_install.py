@@ -274,7 +274,7 @@ def test_the_unit_starts_watches_and_darkens() -> None:
     parser.read_string(UNIT.read_text())
     assert parser.sections() == ["Unit", "Service", "Install"]
     assert unit_values("ExecStart") == [
-        "/opt/bikeped/venv/bin/bikeped run -c /etc/bikeped/config.yaml"
+        "/opt/bikeped/venv/bin/bikeped run -c /etc/bikeped/config.yaml --last-good /var/lib/bikeped"
     ]
     assert unit_values("Type") == ["notify"]
     assert unit_values("NotifyAccess") == ["main"]
