@@ -128,7 +128,7 @@ def _span(text: str, section: str, source: str) -> tuple[int, int, str]:
     """First and one past the last character of a section's lines, and their indentation.
 
     Comments that are indented deeper than the section's name belong to it, others to what follows.
-    A section that is not there begins and ends at the text's end.
+    A section that is not there begins and ends at the text's end, or before `complete`.
     """
     root = _compose(text, source)
     if root is None:
@@ -142,8 +142,9 @@ def _span(text: str, section: str, source: str) -> tuple[int, int, str]:
     column = keys[0].column
     indent = text[starts[0] : starts[0] + column]
     names = [key.value for key, _ in root.value]
-    if section not in names:
-        return len(text), len(text), indent
+    if section not in names:  # `complete: true` stays the last line
+        end = starts[names.index("complete")] if names[-1] == "complete" else len(text)
+        return end, end, indent
     at = names.index(section)
     start, end = starts[at], starts[at + 1]
     while True:  # leave what is not its own at its end: blank lines, comments, the end mark

@@ -30,7 +30,7 @@ from bikeped.detection.output_layouts import Candidates, Layout, choose_layout, 
 from bikeped.detection.person_boxes import join_riders, suppress_partial_person_boxes
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.errors import DetectorError
-from bikeped.models import model_file
+from bikeped.models import BUNDLED_SHA256, model_file
 from bikeped.types import (
     BoolArray,
     Detections,
@@ -339,7 +339,7 @@ def load_detector(config: DetectionConfig, base_dir: Path, road: Region | None =
         from bikeped.detection.onnx_runtime import OnnxBackend, runs_on_cpu
 
         path = model_file(config.model, base_dir, on_cpu=runs_on_cpu(config.providers))
-        digest = sha256_of(path, config.sha256)
+        digest = sha256_of(path, BUNDLED_SHA256.get(path, config.sha256))
         backend: Backend = OnnxBackend(path, config, digest, road)
     elif path.suffix.lower() == ".engine":
         from bikeped.detection.trt_engine import EngineBackend

@@ -18,6 +18,12 @@ BUNDLED_INT8_FILE = Path(__file__).with_name("small-int8.onnx")
 #: A drawn picture in which the bundled model must find what check.json says.
 CHECK_PICTURE_FILE = Path(__file__).with_name("check.jpg")
 
+#: SHA-256 of the bundled files: they are never loaded with another content.
+BUNDLED_SHA256 = {
+    BUNDLED_FILE: "a9877bdf3f2b92e7ddffcb9120dd5b594a8bba3337de3b8d52abea3165971786",
+    BUNDLED_INT8_FILE: "1d90a19da5944fd5312a188224f306db994fc0e35e1e1246ca9172497e24fc49",
+}
+
 
 def model_file(model: str, base_dir: Path, *, on_cpu: bool = False) -> Path:
     """The file of `detection.model`, relative to `base_dir`; `on_cpu`: to run on a processor."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from bikeped.config.edit import set_values
 from bikeped.config.lens_check import checksum
 from bikeped.config.load import load_config, parse_config
 from bikeped.config.runnable import check_runnable, is_complete, warnings
@@ -207,3 +208,10 @@ def test_a_checksum_finds_what_no_range_can(tmp_path):
 def test_the_bundled_calibration_has_its_checksum():
     assert LENS["checksum"] == checksum(LENS)
     assert list(LENS)[-1] == "complete"
+
+
+def test_a_new_section_goes_before_the_last_line():
+    text = NO_FILE + "complete: true\n"
+    after = set_values(text, {"web": {"port": 1}}, "site.yaml")
+    assert is_complete(parse(after))
+    assert parse(after).config.web.port == 1
