@@ -105,6 +105,9 @@ FAULT_KINDS: dict[str, FaultKind] = {
             "The model misses what it found in a check picture, or finds nothing while much moves.",
         ),
         _begins("service.starting", "service", "The model loads, or the first frames are due."),
+        _stops(
+            "service.unsteady", "service", "FAULT comes and goes; a longer good time is awaited."
+        ),
         _begins("service.recovering", "service", "A fault is over; good frames are counted."),
         _withholds("service.unsteady", "service", "The service ended soon after its start before."),
         _minor(
@@ -141,6 +144,8 @@ FAULT_KINDS: dict[str, FaultKind] = {
         ),
         _stops("lamp.silent", "light", "The lamp's process does not answer."),
         _minor("camera.moved_slightly", "camera", "The camera has moved a little; align it again."),
+        _minor("camera.slow", "camera", "Less than half of the camera's frames arrive."),
+        _minor("service.slow", "service", "The light follows the picture too late."),
         _minor("speaker.error", "speaker", "A sound could not be played."),
         _minor("audit.error", "audit", "The audit log cannot be written."),
     )

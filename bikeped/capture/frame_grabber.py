@@ -8,6 +8,7 @@ import logging
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -64,6 +65,7 @@ class FrameGrabber:
         clock: Callable[[], float] = time.monotonic,
         stale_after_s: float = 2.0,
         hang_after_s: float = 2.0,
+        max_fps: float = math.inf,
         first_pause_s: float = 0.25,
         max_pause_s: float = 1.0,
         healthy_after_s: float = 1.0,
@@ -87,6 +89,9 @@ class FrameGrabber:
         self.error: CaptureError | None = None  #: why there are no frames; None since a frame came
         self.ended = False  #: whether the source has come to its end
         self._arrived_s: float | None = None
+        self._arrivals: deque[float] = deque(maxlen=512)
+        self._max_fps = max_fps
+        self.nominal_fps: float | None = None  #: the highest stated, at most `max_fps`
 
     def start(self) -> None:
         """Starts the thread, once."""
@@ -135,6 +140,18 @@ class FrameGrabber:
         """Time since the last frame arrived; infinite before the first."""
         with self._lock:
             return math.inf if self._arrived_s is None else now_s - self._arrived_s
+
+    def rate(self, now_s: float, window_s: float) -> tuple[float, float] | None:
+        """Frames per second that arrived in the last `window_s`, and their nominal rate.
+
+        None before a whole window has passed since the first, and while none comes.
+        """
+        with self._lock:
+            arrivals, nominal = list(self._arrivals), self.nominal_fps
+        recent = sum(now_s - window_s < at_s <= now_s for at_s in arrivals)
+        if not recent or nominal is None or now_s - arrivals[0] < window_s:
+            return None
+        return recent / window_s, nominal
 
     def replace_hung(self, now_s: float) -> str | None:
         """Leaves a call that has not returned to its thread, and opens the source in a new one.
@@ -191,6 +208,7 @@ class FrameGrabber:
         source = self._timed(reader, self._open_source, opening=True)
         try:
             opened_s = fresh_s = self._clock()
+            self.nominal_fps = min(max(self.nominal_fps or 0.0, source.fps), self._max_fps)
             last_captured_s = -math.inf
             while not (self._over(reader) or self._restart.is_set()):
                 frame = self._timed(reader, source.read)
@@ -232,6 +250,7 @@ class FrameGrabber:
             self._taken = False
             self.frames += 1
             self._arrived_s = now_s
+            self._arrivals.append(now_s)
             self.error = None
         self._wake()
 

@@ -23,12 +23,15 @@ The machine counts good frames: new decisions without a fault, in a row. It star
 * ALERT is held for `hold_alert_s`, so that a single frame of it is visible. The hold outlives a
   fault that begins meanwhile, but a fault does not renew it: red ends with the hold, then FAULT.
 * Blue, green and steady orange need the full count: a light never shows them before frames came.
+* FAULT that comes and goes is waited out: from the third within `FLICKER_S` on that ends another
+  light, the light leaves it only after `UNSTEADY_S` without a fault, doubled with each more.
 * A fault that only withholds (people may be missed) shows FAULT where blue or green would show; it
   leaves the count, WARNING and ALERT alone.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from bikeped.config.output_sections import FeedbackConfig
@@ -37,6 +40,9 @@ from bikeped.types import Colour, Signal, Sound, State
 
 #: The fault shown before the first `recover_frames` good frames.
 STARTING = Fault("starting", "service.starting", "not enough good frames yet")
+
+#: Within this time so many falls into FAULT are flicker, and the first wait for a steady light.
+FLICKER_S, FLICKERS, UNSTEADY_S, LONGEST_WAIT_S = 30.0, 3, 5.0, 30.0
 
 OFF = Signal("OFF", Colour.OFF)
 
@@ -73,6 +79,9 @@ class SignalLogic:
         self._recovering_from: tuple[Fault, ...] = (STARTING,)
         self._decided: State | None = None  # by the newest good frame
         self._alert_s: float | None = None  # time of the newest ALERT
+        self._falls_s: list[float] = []  # when FAULT followed a light that was trusted
+        self._steady_from_s = -math.inf  # until then the light stays in FAULT
+        self._unsteady: tuple[Fault, ...] = ()
         self._shown = "FAULT"
 
     @classmethod
@@ -98,6 +107,7 @@ class SignalLogic:
         if decided is State.ALERT:
             self._alert_s = now_s
         if stopping:
+            self._count_falls(now_s)
             self._good_frames = 0
             self._recovering_from = tuple(
                 Fault("recovering", "service.recovering", str(fault)) for fault in stopping
@@ -105,7 +115,10 @@ class SignalLogic:
         elif decided is not None:
             self._decided = decided
             self._good_frames = min(self._good_frames + 1, self.recover_frames)
+        if now_s < self._steady_from_s and not stopping:
+            faults = (*self._unsteady, *faults)
         trusted = self._decided if self._good_frames >= self.recover_frames else None
+        trusted = None if now_s < self._steady_from_s else trusted
 
         if self._alert_held(now_s) or trusted is State.ALERT:
             # The faults travel with the red light, so that telemetry sees them.
@@ -120,6 +133,20 @@ class SignalLogic:
             signal = Signal(trusted.name, _STEADY[trusted], sound=sound, faults=faults)
         self._shown = signal.name
         return signal
+
+    def _count_falls(self, now_s: float) -> None:
+        """A fault is here: counts a fall from a trusted light, and sets the wait that follows."""
+        trusted = self._good_frames >= self.recover_frames and now_s >= self._steady_from_s
+        self._falls_s = [at_s for at_s in self._falls_s if 0 <= now_s - at_s < FLICKER_S]
+        if trusted:
+            self._falls_s.append(now_s)
+        more = len(self._falls_s) - FLICKERS
+        if more >= 0:
+            wait_s = min(UNSTEADY_S * 2.0**more, LONGEST_WAIT_S)
+            self._steady_from_s = now_s + wait_s
+            text = f"FAULT came {len(self._falls_s)} times in {FLICKER_S:g} s: waiting for "
+            text += f"{wait_s:g} s without a fault"
+            self._unsteady = (Fault("service", "service.unsteady", text),)
 
     def _alert_held(self, now_s: float) -> bool:
         """Whether the newest ALERT still keeps the light red.

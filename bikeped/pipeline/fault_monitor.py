@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from bikeped.faults import Effect, Fault
 from bikeped.pipeline.feed import Feed
+from bikeped.pipeline.pace import Pace
 from bikeped.pipeline.picture_monitor import NO_CHECKS, PictureChecks
 from bikeped.pipeline.runtime import WorkerThread
 
@@ -63,6 +64,7 @@ class FaultMonitor:
         self._sources = tuple(sources)
         self._failures: dict[str, _Failure] = {}  # by code
         self._answered_s = -math.inf  # capture time of the newest processed frame
+        self._pace = Pace(limits.silent_after_s / 2)
         self.picture = NO_CHECKS  #: of the newest processed frame
 
     def record(self, code: str, source: str, detail: str | None, now_s: float) -> None:
@@ -72,9 +74,13 @@ class FaultMonitor:
         elif code not in self._failures:
             self._failures[code] = _Failure(Fault(source, code, detail), now_s)
 
-    def processed(self, captured_s: float, checks: PictureChecks = NO_CHECKS) -> None:
+    def processed(
+        self, captured_s: float, checks: PictureChecks = NO_CHECKS, now_s: float | None = None
+    ) -> None:
         """The frame captured at `captured_s` led to a decision; `checks`: of its picture."""
         self._answered_s, self.picture = captured_s, checks
+        if now_s is not None:
+            self._pace.answered(now_s, now_s - captured_s)
 
     def faults(self, now_s: float) -> tuple[Fault, ...]:
         """The faults that the light shows; empty when the decision holds."""
@@ -99,7 +105,7 @@ class FaultMonitor:
     def notices(self) -> tuple[Fault, ...]:
         """The faults that leave the light as decided."""
         checks = (f for f in self.picture.faults() if f.kind.effect is Effect.NOTICE)
-        return (*checks, *self._from_sources(Effect.NOTICE))
+        return (*checks, *self._pace.faults, *self._from_sources(Effect.NOTICE))
 
     def _failed(self, *codes: str) -> list[Fault]:
         return [self._failures[code].fault for code in codes if code in self._failures]
@@ -115,6 +121,7 @@ class FaultMonitor:
         """
         if (problem := self._feed.replace_hung(now_s)) is not None:
             raise StageHangError(Fault("camera", "camera.hang", problem))
+        self._pace.check(now_s, self._feed)
         limit_s, busy_s = self._limits.hang_after_s, max(w.busy_s(now_s) for w in workers)
         hung = [("detector.hang", busy_s, "has not returned")]
         if (failing := self._failures.get("detector.error")) is not None:

@@ -29,6 +29,10 @@ class Feed:
         """Time since the newest frame arrived, on the loop's clock; infinite before the first."""
         return math.inf
 
+    def rate(self, now_s: float, window_s: float) -> tuple[float, float] | None:
+        """Frames per second of the last `window_s`, and their nominal rate; None: not known."""
+        return None
+
     def replace_hung(self, now_s: float) -> str | None:
         """Opens the source anew where a read hangs; why only a new process helps, else None."""
         return None

@@ -226,7 +226,7 @@ class Loop:
         )
         if self.watch is not None:
             await self.watch.on_answer(decoded, answer.detections)
-        self.monitor.processed(frame.captured_s, decoded.checks)
+        self.monitor.processed(frame.captured_s, decoded.checks, now_s)
         self.counts.frames += 1
         began = time.perf_counter()
         signal = self._dispatcher.dispatch(now_s, tracking.decision, self.monitor.faults(now_s))

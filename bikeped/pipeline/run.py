@@ -110,6 +110,7 @@ async def _run(
             partial(_open_camera, loaded),
             stale_after_s=stale_after_s,
             hang_after_s=config.camera.hang_after_s,
+            max_fps=config.camera.fps,
         )
         application = Application(
             loaded,

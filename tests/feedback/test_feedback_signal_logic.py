@@ -260,3 +260,51 @@ def test_every_pair_of_states_follows_at_once_outside_alert() -> None:
         logic, now_s = recovered()
         logic.next_signal(now_s, first)
         assert logic.next_signal(now_s + FRAME_S, second).name == second.name
+
+
+def _fall(logic, now_s, *, frames=5):
+    """Good frames from `now_s` on, and then a fault; returns the last signal before the fault."""
+    for number in range(frames):
+        signal = logic.next_signal(now_s + number / 30, State.SAFE)
+    logic.next_signal(now_s + frames / 30, None, (NO_FRAME,))
+    return signal.name
+
+
+NO_FRAME = Fault("camera", "camera.no_frame", "no frame for more than 0.5 s")
+
+
+def test_from_the_third_fall_on_a_steady_time_is_awaited_and_said():
+    logic = SignalLogic()
+    assert [_fall(logic, at_s) for at_s in (0.0, 2.0, 4.0)] == ["SAFE"] * 3
+    last_s = 4.0 + 5 / 30
+    for tick in range(49):
+        signal = logic.next_signal(last_s + (tick + 1) / 10, State.SAFE)
+        assert signal.name == "FAULT"
+        assert [fault.code for fault in signal.faults] == ["service.unsteady"]
+    assert "3 times in 30 s: waiting for 5 s" in signal.faults[0].detail
+    assert logic.next_signal(last_s + 5.0, State.SAFE).name == "SAFE"
+
+
+def test_the_wait_begins_anew_with_a_fault_and_doubles_with_the_next_fall():
+    logic = SignalLogic()
+    for at_s in (0.0, 1.0, 2.0):
+        _fall(logic, at_s)
+    assert _fall(logic, 6.0) == "FAULT"  # within the wait: it is not a fall, but begins it anew
+    again_s = 6.0 + 5 / 30
+    assert logic.next_signal(again_s + 4.9, State.SAFE).name == "FAULT"
+    assert _fall(logic, again_s + 5.0) == "SAFE"
+    assert logic.next_signal(again_s + 14.9, State.SAFE).name == "FAULT"
+
+
+def test_an_alert_shows_while_a_steady_time_is_awaited():
+    logic = SignalLogic()
+    for at_s in (0.0, 1.0, 2.0):
+        _fall(logic, at_s)
+    assert logic.next_signal(3.0, State.ALERT).name == "ALERT"
+    assert logic.next_signal(4.5, State.SAFE).name == "FAULT"
+
+
+def test_falls_that_are_far_apart_cost_no_wait():
+    logic = SignalLogic()
+    assert [_fall(logic, at_s) for at_s in (0.0, 20.0, 40.0, 60.0)] == ["SAFE"] * 4
+    assert _fall(logic, 61.0) == "SAFE"

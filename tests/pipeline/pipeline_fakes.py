@@ -83,6 +83,9 @@ class FakeFeed:
     def age_s(self, now_s: float) -> float:
         return math.inf if self.last_s is None else now_s - self.last_s
 
+    def rate(self, now_s: float, window_s: float) -> tuple[float, float] | None:
+        return None
+
     def replace_hung(self, now_s: float) -> str | None:
         return self.hopeless
 
