@@ -104,6 +104,11 @@ FAULT_KINDS: dict[str, FaultKind] = {
             "detector",
             "The model misses what it found in a check picture, or finds nothing while much moves.",
         ),
+        _minor(
+            "detector.crowded",
+            "detector",
+            "More road users of a kind than are tracked; the least confident are left out.",
+        ),
         _begins("service.starting", "service", "The model loads, or the first frames are due."),
         _stops(
             "service.unsteady", "service", "FAULT comes and goes; a longer good time is awaited."

@@ -43,6 +43,10 @@ def rule_settings(decision: DecisionConfig, speed_window_frames: int = 4) -> Rul
     )
 
 
+#: Tracks at a time, so that ghosts of a detector gone wrong do not pile up.
+MAX_TRACKS = 256
+
+
 def tracker_settings(
     tracking: TrackingConfig,
     nominal_fps: float = 30.0,
@@ -71,6 +75,7 @@ def tracker_settings(
         max_range_m=tracking.max_range_m,
         rider_radius_m=tracking.rider_radius_m,
         cyclist_box_includes_rider=cyclist_box_includes_rider,
+        max_tracks=MAX_TRACKS,
     )
 
 

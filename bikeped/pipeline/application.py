@@ -163,6 +163,7 @@ class Application:
                 lambda: None if speaker is None else speaker.fault,
                 lambda: None if audit is None else audit.fault,
                 lambda: light.fault,
+                lambda: track_and_decide.fault,
                 lambda: None if loaded.config.monitor.picture else UNCHECKED,
             ),
             watch=watch,

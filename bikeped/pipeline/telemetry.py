@@ -185,6 +185,7 @@ class Telemetry:
             mqtt_dropped=self._mqtt.status.dropped if self._mqtt else 0,
             audit_dropped=self._audit.dropped if self._audit else 0,
             log_dropped=dropped_lines(),
+            capped=self._track_and_decide.capped_frames,
         )
 
     def publish_health(self, message: HealthMessage) -> None:

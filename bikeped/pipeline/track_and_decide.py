@@ -16,10 +16,21 @@ import numpy as np
 from bikeped.config.build import framing, ground_camera, rule_settings, tracker_settings
 from bikeped.config.load import LoadedConfig
 from bikeped.decision.decider import Decider
+from bikeped.faults import Fault
 from bikeped.geometry.camera import GroundTable
 from bikeped.geometry.framing import Framing
 from bikeped.tracking.tracker import Tracker, predict
-from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Tracks
+from bikeped.types import Decision, Detections, Float32Array, FloatArray, GroundPoints, Kind, Tracks
+
+#: Road users of one kind that are tracked of one frame, so that the decision stays under 5 ms
+#: whatever the detector returns. A cap a kind, for vehicles must not push out cyclists; and as 48
+#: of a kind stay present, what is left out cannot turn a WARNING into SAFE or IDLE.
+MAX_OF_A_KIND = 48
+CROWDED = Fault(
+    "detector",
+    "detector.crowded",
+    f"more than {MAX_OF_A_KIND} of a kind: the faintest are left out",
+)
 
 
 class GroundMapper:
@@ -88,6 +99,8 @@ class TrackAndDecide:
         self._rule = rule_settings(config.decision, config.tracking.speed_window_frames)
         self._latency = config.latency
         self._fixed_ahead_s = config.latency.frames / fps
+        self.capped_frames = 0  #: frames of which not all detections were tracked
+        self.fault: Fault | None = None  #: of the newest frame
         self.reset()
 
     def reset(self) -> None:
@@ -107,6 +120,11 @@ class TrackAndDecide:
         began = time.perf_counter()
         mapper = self.ground_mapper
         points, not_on_ground = mapper.to_ground(detections, mapper.framing_for(width, height))
+        self.fault = None
+        if np.bincount(points.kind, minlength=1).max() > MAX_OF_A_KIND:
+            points = _most_confident(points, detections.confidence)
+            self.capped_frames += 1
+            self.fault = CROWDED
         return self.update_from_points(points, captured_s, age_s, not_on_ground, began)
 
     def update_from_points(
@@ -143,3 +161,15 @@ class TrackAndDecide:
         ahead_s = min(max(ahead_s + latency.camera_offset_s, 0.0), latency.max_s)
         velocity, acceleration = self.tracker.smoothed()
         return predict(tracks.xy_m, velocity, acceleration, ahead_s, latency.order)
+
+
+def _most_confident(points: GroundPoints, confidence: Float32Array) -> GroundPoints:
+    """Of each kind the `MAX_OF_A_KIND` most confident, of equals the nearest to the camera.
+
+    `confidence` [d] is that of the detections, which `points.detection` numbers.
+    """
+    distance_m = np.hypot(points.xy_m[:, 0], points.xy_m[:, 1])
+    order = np.lexsort((distance_m, -confidence[points.detection]))
+    kind = points.kind[order]
+    kept = np.sort(np.concatenate([order[kind == k][:MAX_OF_A_KIND] for k in Kind]))
+    return GroundPoints(points.kind[kept], points.xy_m[kept], points.detection[kept])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import socket
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, get_args
 
 import msgspec
@@ -25,6 +27,14 @@ Health = Callable[[], Mapping[str, Any]]
 _HEALTHY = frozenset(get_args(ShownState)) - {"FAULT"}
 #: A connection without a request for this long is closed, to free its place.
 IDLE_S = 20.0
+#: Requests answered a second, by a service.
+REQUESTS_HZ = 40.0
+#: A client that takes nothing of its answer for this long is cut off.
+SEND_S = 10.0
+#: Bytes that the system holds for a slow client, and of an upload: what one turn of the loop takes.
+_SEND_BUFFER, _RECEIVE_BUFFER = 128 * 1024, 16 * 1024
+#: All that ask for metrics within this time get the same text.
+_METRICS_S = 0.5
 #: How long the rest of a refused body is read and discarded, so that the sender gets the answer.
 _LINGER_S = 0.5
 #: Turns of asyncio's loop from an accepted socket to its `connection_made`, and one more.
@@ -39,11 +49,17 @@ def add_monitoring(app: web.Application, registry: CollectorRegistry, health: He
     FAULT, unknown or absent, and when `health` raises.
     """
 
+    rendered: dict[str, tuple[float, asyncio.Future[bytes]]] = {}
+
     async def metrics(request: web.Request) -> web.Response:
         encode, content_type = choose_encoder(request.headers.get("Accept", ""))
-        # Rendering takes milliseconds: too long for the event loop.
-        body = await asyncio.to_thread(encode, registry)
-        return web.Response(body=body, headers={"Content-Type": content_type})
+        now_s = time.monotonic()
+        made_s, body = rendered.get(content_type, (-math.inf, None))
+        if body is None or now_s - made_s > _METRICS_S:
+            # Rendering takes milliseconds: too long for the event loop, too long for each reader.
+            body = asyncio.ensure_future(asyncio.to_thread(encode, registry))
+            rendered[content_type] = now_s, body
+        return web.Response(body=await asyncio.shield(body), headers={"Content-Type": content_type})
 
     async def healthz(_request: web.Request) -> web.Response:
         try:
@@ -63,6 +79,27 @@ def add_monitoring(app: web.Application, registry: CollectorRegistry, health: He
 
     app.router.add_get("/metrics", metrics)
     app.router.add_get("/healthz", healthz)
+
+
+def limit_rate(app: web.Application) -> None:
+    """Answers at most REQUESTS_HZ requests a second, after as many at once; the others wait.
+
+    The loop that answers is the one that watches the crossing.
+    """
+    free_s = -math.inf
+
+    @web.middleware
+    async def wait_for_turn(
+        request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        nonlocal free_s
+        now_s = time.monotonic()
+        free_s = max(free_s, now_s - 1.0) + 1.0 / REQUESTS_HZ
+        if free_s > now_s:
+            await asyncio.sleep(free_s - now_s)
+        return await handler(request)
+
+    app.middlewares.insert(0, wait_for_turn)
 
 
 class HttpServer:
@@ -109,6 +146,8 @@ class HttpServer:
             self.error = _bind_error(config, exc)
             log.error("web: %s", self.error)
             return False
+        for listening in self._server.sockets:
+            _bound_buffers(listening)
         self._runner = runner
         self.error = None
         self.port = int(self._server.sockets[0].getsockname()[1])
@@ -141,6 +180,15 @@ class HttpServer:
             connection.abort()
         for _ in range(_TURNS_TO_ACCEPT):  # until their closing is processed
             await asyncio.sleep(0)
+
+
+def _bound_buffers(listening: Any) -> None:
+    """What the sockets of accepted connections inherit: small buffers, and an end to waiting."""
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
+        limit_ms = round(SEND_S * 1e3)
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, limit_ms)
 
 
 def _not_malformed(record: logging.LogRecord) -> bool:

@@ -36,6 +36,7 @@ _TOTALS = {
     "mqtt_dropped": ("mqtt_dropped", "MQTT messages dropped"),
     "audit_dropped": ("audit_dropped", "Audit log lines not written"),
     "log_dropped": ("log_dropped", "Log lines lost because standard error took none"),
+    "capped": ("frames_capped", "Frames of which not all detections were tracked"),
 }
 
 

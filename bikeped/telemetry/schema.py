@@ -117,6 +117,9 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True):
     mqtt_dropped: Annotated[Count, Meta(description="messages dropped before reaching the broker")]
     audit_dropped: Annotated[Count, Meta(description="event lines not written to the audit log")]
     log_dropped: Annotated[Count, Meta(description="log lines lost: standard error took none")] = 0
+    capped: Annotated[
+        Count, Meta(description="frames of which not all detections were tracked")
+    ] = 0
 
 
 class CheckStatus(msgspec.Struct, frozen=True, kw_only=True):

@@ -86,6 +86,7 @@ class TrackerSettings:
     person without a track within this radius of an unmatched cyclist's track continues that track
     (and the reverse), so that one rider does not become a cyclist and a pedestrian who close in.
     0: never, as in the paper's simulation, whose agents have one kind.
+    `max_tracks`: above it, those unseen for longest are dropped, unconfirmed ones first; 0: no cap.
     `cyclist_box_includes_rider`: the detector boxes rider and cycle as one, so a track has the kind
     of most of its recent detections. `acceleration`: estimate it, for second-order prediction.
     """
@@ -103,6 +104,7 @@ class TrackerSettings:
     rider_radius_m: float = 0.0
     cyclist_box_includes_rider: bool = False
     acceleration: bool = True
+    max_tracks: int = 0
 
 
 class BatchTracker:
@@ -162,6 +164,8 @@ class BatchTracker:
         if refused is not None:
             fresh &= ~refused
         if np.count_nonzero(fresh):
+            if self.settings.max_tracks:
+                self._make_room(fresh)
             self._add(time_s, xy_m, kind, fresh)
 
     def _match(self, xy_m: FloatArray, kind: KindArray) -> tuple[IndexArray, BoolArray | None]:
@@ -310,6 +314,15 @@ class BatchTracker:
             self.alive &= confirmed | (unseen <= _TENTATIVE_MAX_UNSEEN_S + _EPSILON_S)
         if math.isfinite(self.settings.max_range_m):
             self.alive &= (self.xy_m**2).sum(-1) <= self.settings.max_range_m**2
+
+    def _make_room(self, fresh: BoolArray) -> None:
+        """Drops tracks not seen now, where there would be more than `max_tracks` with `fresh`."""
+        over = self.alive.sum(axis=1) + fresh.sum(axis=1) - self.settings.max_tracks
+        for scene in (over > 0).nonzero()[0]:
+            unseen = (self.alive[scene] & (self.seen_s[scene] < self.time_s)).nonzero()[0]
+            confirmed = self.hits[scene, unseen] >= self.settings.confirm_hits
+            order = np.lexsort((self.seen_s[scene, unseen], confirmed))
+            self.alive[scene, unseen[order[: over[scene]]]] = False
 
     def _add(self, time_s: float, xy_m: FloatArray, kind: KindArray, fresh: BoolArray) -> None:
         need = fresh.sum(axis=1)

@@ -9,6 +9,7 @@ token once, on the login page or in a link `/?token=...`, and keeps a cookie; pr
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hashlib
 import hmac
@@ -33,6 +34,7 @@ SESSION_S = 7 * 24 * 3600
 SHORTEST_TOKEN = 12
 #: Bytes of a request's body: settings and scenarios, as text.
 MAX_BODY = 1024 * 1024
+BODY_S = 20.0  #: how long a body may take to arrive
 #: Paths that need no session: what the login page is made of.
 _OPEN = ("/login", "/session", "/static/")
 _SAFE_METHODS = frozenset({hdrs.METH_GET, hdrs.METH_HEAD, hdrs.METH_OPTIONS})
@@ -193,12 +195,7 @@ def guard(
             )
         if not _is_same_origin(request):
             raise web.HTTPForbidden(text="Another site may not do this: open the page itself.")
-        if (request.content_length or 0) > MAX_BODY:
-            raise web.HTTPRequestEntityTooLarge(
-                max_size=MAX_BODY,
-                actual_size=request.content_length or 0,
-                headers={hdrs.CONNECTION: "close"},
-            )
+        await _read_body(request)
         if request.path.startswith(_OPEN) or policy.has_session(request):
             return await handler(request)
         scheme, _, given = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
@@ -208,6 +205,26 @@ def guard(
         return login(request)
 
     return check
+
+
+async def _read_body(request: web.Request) -> None:
+    """Reads the body, which the request keeps; HTTPRequestEntityTooLarge from MAX_BODY on.
+
+    On every path, also where nothing wants it: what is not read here would arrive all the same.
+    """
+    try:
+        if (request.content_length or 0) <= MAX_BODY:
+            await asyncio.wait_for(request.read(), BODY_S)
+            return
+    except asyncio.TimeoutError as error:
+        raise web.HTTPRequestTimeout(text="The request's body did not arrive.") from error
+    except web.HTTPRequestEntityTooLarge:  # of unknown length
+        pass
+    raise web.HTTPRequestEntityTooLarge(
+        max_size=MAX_BODY,
+        actual_size=request.content_length or MAX_BODY + 1,
+        headers={hdrs.CONNECTION: "close"},
+    )
 
 
 def check_token(
@@ -236,7 +253,7 @@ def _is_same_origin(request: web.Request) -> bool:
     """
     headers = request.headers
     changes = request.method not in _SAFE_METHODS or hdrs.UPGRADE in headers
-    if changes and hdrs.ORIGIN in headers and not _origin_matches_host(headers):
+    if hdrs.ORIGIN in headers and not _origin_matches_host(headers):
         return False
     site = headers.get("Sec-Fetch-Site")
     if site is None or site == "same-origin":

@@ -44,7 +44,6 @@ WEB_FOLDER = Path(__file__).parent
 _TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 #: The order of the navigation.
 _ORDER = ("/", "/align", "/testbench")
-_BODY_S = 20.0  #: how long a body may take to arrive
 
 
 @dataclass(frozen=True)
@@ -154,11 +153,7 @@ async def json_body(request: web.Request, kind: type[T]) -> T:
     if request.content_type != "application/json":
         raise web.HTTPUnsupportedMediaType(text="Send JSON: Content-Type: application/json.")
     try:
-        text = await asyncio.wait_for(request.read(), _BODY_S)
-    except asyncio.TimeoutError as error:
-        raise web.HTTPRequestTimeout(text="The request's body did not arrive.") from error
-    try:
-        return msgspec.json.decode(text, type=kind)
+        return msgspec.json.decode(await request.read(), type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BikepedError(f"request: {error}") from error
 
@@ -279,10 +274,9 @@ async def _login_form(request: web.Request) -> web.Response:
 
 
 async def _log_in(request: web.Request) -> web.Response:
-    try:
-        form = await asyncio.wait_for(request.post(), _BODY_S)
-    except asyncio.TimeoutError as error:
-        raise web.HTTPRequestTimeout(text="The form did not arrive.") from error
+    if request.content_type.startswith("multipart/"):  # the login page's form is not
+        raise web.HTTPUnsupportedMediaType(text="Send the form as the login page does.")
+    form = await request.post()
     return _try_login(request, str(form.get("token", "")), str(form.get("next", "/")))
 
 

@@ -10,7 +10,7 @@ from aiohttp import web
 from bikeped.config.load import LoadedConfig
 from bikeped.pipeline.application import WebContext
 from bikeped.pipeline.loop import FrameResult
-from bikeped.telemetry.http_server import add_monitoring
+from bikeped.telemetry.http_server import add_monitoring, limit_rate
 from bikeped.types import Decision, Frame, Signal
 from bikeped.web.align import add_align
 from bikeped.web.live import LivePage, add_live
@@ -41,6 +41,7 @@ class ServicePages:
             partial(add_live, live=LivePage(self.state, web_context)),
             partial(add_align, loaded=web_context.loaded, frame=self.newest),
         )
+        limit_rate(app)
         add_monitoring(app, web_context.metrics, lambda: msgspec.to_builtins(web_context.health()))
         return app
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bikeped.config.build import MAX_TRACKS
 from bikeped.config.load import load_config
-from bikeped.pipeline.track_and_decide import TrackAndDecide
+from bikeped.pipeline.track_and_decide import CROWDED, MAX_OF_A_KIND, TrackAndDecide
 from bikeped.types import Detections, GroundPoints, Kind, State
 
 P, C = Kind.PEDESTRIAN, Kind.CYCLIST
@@ -114,3 +115,55 @@ def test_the_speed_window_reaches_the_rule(frames, speed_mps):
         decision = track_and_decide.update_from_points(points, frame / 30).decision
     assert decision.pair is not None
     assert decision.pair.speed_mps == pytest.approx(speed_mps)
+
+
+def boxes(kinds: list[Kind], confidence: list[float], rng: np.random.Generator) -> Detections:
+    """Detections of 3840 x 2160 with their feet in the lower half, most confident first."""
+    n = len(kinds)
+    feet = np.stack([rng.uniform(400, 3440, n), rng.uniform(1150, 2050, n)], axis=1)
+    box = np.hstack([feet - np.array([40, 150]), feet + np.array([40, 0])]).astype(np.float32)
+    order = np.argsort(confidence)[::-1]
+    kind, score = np.array(kinds, np.int8)[order], np.array(confidence, np.float32)[order]
+    return Detections(kind, score, box)
+
+
+def test_of_two_thousand_detections_the_most_confident_of_each_kind_are_tracked():
+    track_and_decide = TrackAndDecide(load_config(None))
+    rng = np.random.default_rng(5)
+    cyclists = 20  # the faintest of all: vehicles and pedestrians do not push them out
+    kinds = [P, Kind.VEHICLE] * 990 + [C] * cyclists
+    for frame in range(12):
+        confidence = np.linspace(0.9, 0.1, len(kinds)).tolist()
+        found = boxes(kinds, confidence, rng)
+        tracking = track_and_decide.update(found, 3840, 2160, frame / 30, 0.0)
+        points = tracking.points
+        count = np.bincount(points.kind, minlength=3)
+        assert count[P] == count[Kind.VEHICLE] == MAX_OF_A_KIND
+        assert 0 < count[C] <= cyclists
+        for kind in (P, Kind.VEHICLE):
+            kept = points.detection[points.kind == kind]
+            on_ground, _ = track_and_decide.ground_mapper.to_ground(
+                found, track_and_decide.ground_mapper.framing_for(3840, 2160)
+            )
+            assert (
+                kept.tolist()
+                == on_ground.detection[on_ground.kind == kind][:MAX_OF_A_KIND].tolist()
+            )
+        assert track_and_decide.fault is CROWDED
+        assert len(tracking.tracks.id) <= MAX_TRACKS
+        assert track_and_decide.tracker.batch.alive.sum() <= MAX_TRACKS
+    assert track_and_decide.capped_frames == 12
+    few = boxes([P, C], [0.9, 0.8], rng)
+    track_and_decide.update(few, 3840, 2160, 1.0, 0.0)
+    assert track_and_decide.fault is None
+    assert track_and_decide.capped_frames == 12
+
+
+def test_of_equally_confident_ones_the_nearest_are_tracked():
+    track_and_decide = TrackAndDecide(load_config(None))
+    found = boxes([P] * 200, [0.5] * 200, np.random.default_rng(6))
+    mapper = track_and_decide.ground_mapper
+    every, _ = mapper.to_ground(found, mapper.framing_for(3840, 2160))
+    points = track_and_decide.update(found, 3840, 2160, 0.0, 0.0).points
+    farthest_m = np.hypot(*points.xy_m.T).max()
+    assert np.count_nonzero(np.hypot(*every.xy_m.T) <= farthest_m) == len(points) == MAX_OF_A_KIND

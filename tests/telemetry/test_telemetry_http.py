@@ -16,7 +16,16 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
 from bikeped.config.output_sections import WebConfig, is_loopback
-from bikeped.telemetry.http_server import Health, HttpServer, add_monitoring, host_name, port_error
+from bikeped.telemetry import http_server
+from bikeped.telemetry.http_server import (
+    REQUESTS_HZ,
+    Health,
+    HttpServer,
+    add_monitoring,
+    host_name,
+    limit_rate,
+    port_error,
+)
 from bikeped.telemetry.metrics import Metrics
 from bikeped.telemetry.schema import Counters
 
@@ -210,3 +219,72 @@ def test_host_names(header: str, name: str):
 )
 def test_loopback(host: str, loopback: bool):
     assert is_loopback(host) is loopback
+
+
+async def test_metrics_are_rendered_once_for_all_that_ask_at_a_time(serve):
+    class Counted(CollectorRegistry):
+        collected = 0
+
+        def collect(self) -> Any:
+            self.collected += 1
+            return super().collect()
+
+    registry = Counted()
+    base = await serve(make_app(Metrics(registry).registry, dict))
+    answers = await asyncio.gather(*(get(f"{base}/metrics") for _ in range(20)))
+    assert all(answer == answers[0] for answer in answers)
+    assert registry.collected < 20
+
+
+async def test_requests_of_a_service_wait_for_their_turn(serve, monkeypatch):
+    now_s, slept = [100.0], []
+    real_sleep = asyncio.sleep
+
+    async def sleep(duration_s: float) -> None:
+        slept.append(duration_s)
+        await real_sleep(0)
+
+    app = make_app(Metrics().registry, lambda: {"state": "SAFE"})
+    limit_rate(app)
+    base = await serve(app)
+    at_once = round(REQUESTS_HZ)
+    monkeypatch.setattr(http_server.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(http_server.asyncio, "sleep", sleep)
+    async with aiohttp.ClientSession() as session:
+
+        async def ask(times: int) -> list[float]:
+            slept.clear()
+            for _ in range(times):
+                async with session.get(f"{base}/healthz") as response:
+                    assert response.status == 200
+            return [duration_s for duration_s in slept if duration_s > 1e-6]
+
+        assert await ask(at_once) == []
+        assert await ask(3) == pytest.approx([n / REQUESTS_HZ for n in (1, 2, 3)])
+        now_s[0] += 60.0
+        assert await ask(at_once) == []
+        monkeypatch.undo()
+
+
+async def test_a_client_that_takes_nothing_is_cut_off(monkeypatch):
+    monkeypatch.setattr(http_server, "SEND_S", 0.5)
+    ended = asyncio.Event()
+
+    async def much(request: web.Request) -> web.StreamResponse:
+        response = web.StreamResponse()
+        await response.prepare(request)
+        try:
+            while True:
+                await response.write(bytes(65536))
+        finally:
+            ended.set()
+
+    app = web.Application()
+    app.router.add_get("/much", much)
+    server = HttpServer(app, WebConfig(port=0))
+    assert await server.start()
+    _, writer = await asyncio.open_connection("127.0.0.1", server.port, limit=1024)
+    writer.write(b"GET /much HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    await asyncio.wait_for(ended.wait(), 60.0)
+    writer.transport.abort()
+    await server.stop()

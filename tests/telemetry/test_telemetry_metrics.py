@@ -95,6 +95,7 @@ def test_gauges():
         ("mqtt_dropped", "mqtt_dropped_total"),
         ("audit_dropped", "audit_dropped_total"),
         ("log_dropped", "log_dropped_total"),
+        ("capped", "frames_capped_total"),
         ("light_errors", "light_faults_total"),
     ],
 )

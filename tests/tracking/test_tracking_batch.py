@@ -349,3 +349,19 @@ def test_lanes_together_equal_each_alone(settings):
                 left, right = getattr(together, name)[scene, :slots], getattr(single, name)[0]
                 assert (left[a] == right[b]).all(), (frame, scene, name)
     assert together.id.max() > 12
+
+
+def test_above_the_cap_the_unconfirmed_go_first_and_then_those_unseen_for_longest():
+    tracker = BatchTracker(TrackerSettings(max_unseen_s=10.0, confirm_hits=2, max_tracks=4))
+
+    def see(time_s: float, *x_m: float) -> set[int]:
+        xy = np.array([[(x, 5.0) for x in x_m]]).reshape(1, -1, 2)
+        tracker.update(time_s, xy, np.zeros((1, len(x_m)), np.int8))
+        return set(tracker.id[0][tracker.alive[0]].tolist())
+
+    assert see(0.0, 0.0, 20.0) == {1, 2}
+    assert see(0.1, 0.0, 20.0) == {1, 2}
+    assert see(0.2, 20.0, 40.0) == {1, 2, 3}  # 3 has been seen once
+    assert see(0.3, 20.0, 60.0, 80.0) == {1, 2, 4, 5}
+    assert see(0.4, 20.0, 60.0, 80.0, 100.0) == {2, 4, 5, 6}  # confirmed, but unseen for longest
+    assert see(0.5, 20.0, 60.0, 80.0, 100.0) == {2, 4, 5, 6}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from bikeped.config.load import parse_config
 from bikeped.config.output_sections import WebConfig
 from bikeped.errors import ConfigError
 from bikeped.telemetry.http_server import HttpServer
+from bikeped.web import security
 from bikeped.web.security import (
     COOKIE,
     MAX_BODY,
@@ -166,11 +168,15 @@ async def test_only_our_own_pages_change_anything(start, headers, status, method
             403,
         ),
         ({"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "cors"}, 403),
+        ({"Origin": "{base}"}, 200),  # browsers without Fetch Metadata
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
     ],
 )
 async def test_other_sites_may_link_but_not_embed(start, headers, status):
     base = await start()
-    assert (await ask("GET", f"{base}/read", headers=headers))[0] == status
+    sent = {name: value.format(base=base) for name, value in headers.items()}
+    assert (await ask("GET", f"{base}/read", headers=sent))[0] == status
 
 
 @pytest.mark.parametrize(
@@ -399,6 +405,41 @@ async def test_a_body_without_a_length_is_cut_off(start):
     except (aiohttp.ClientError, ConnectionError):
         return  # cut off before the answer could be read
     assert status == 413
+
+
+@pytest.mark.parametrize("path", ["/login", "/nope", "/read", "/session"])
+async def test_a_hundred_megabytes_in_chunks_are_refused_on_every_path(start, path):
+    base = await start()
+    reader, writer = await asyncio.open_connection("127.0.0.1", int(base.rpartition(":")[2]))
+    writer.write(
+        f"POST {path} HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n".encode()
+    )
+    answer = asyncio.create_task(reader.readline())
+    chunks = 0
+    with contextlib.suppress(ConnectionError):
+        while chunks < 1600 and not answer.done():
+            writer.write(b"10000\r\n" + bytes(65536) + b"\r\n")
+            chunks += 1
+            await asyncio.wait_for(writer.drain(), 20)
+    assert (await answer).startswith(b"HTTP/1.1 413 ")
+    assert chunks < 1600
+    writer.transport.abort()
+
+
+async def test_a_body_that_does_not_arrive_is_not_waited_for(start, monkeypatch):
+    monkeypatch.setattr(security, "BODY_S", 0.05)
+    base = await start()
+    reader, writer = await asyncio.open_connection("127.0.0.1", int(base.rpartition(":")[2]))
+    writer.write(b"POST /nope HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nx")
+    assert (await asyncio.wait_for(reader.readline(), 20)).startswith(b"HTTP/1.1 408 ")
+    writer.transport.abort()
+
+
+async def test_a_form_in_parts_is_no_login(start):
+    base = await start(LOCKED)
+    form = aiohttp.FormData({"token": TOKEN}, default_to_multipart=True)
+    status, _, _ = await ask("POST", f"{base}/login", data=form, headers={"Origin": base})
+    assert 400 <= status < 500
 
 
 # --- headers
