@@ -138,14 +138,10 @@ FAULT_KINDS: dict[str, FaultKind] = {
             clears=Clears.RESTART,
         ),
         _stops(
-            "light.mismatch",
-            "light",
-            "Other lamps are lit than were set; the lamp shows FAULT until `bikeped lamp reset`.",
-        ),
-        _stops(
             "lamp.latched",
             "light",
-            "Heartbeats came and went; the lamp shows FAULT until `bikeped lamp reset`.",
+            "Heartbeats came and went, or other lamps were lit than were set; the lamp shows "
+            "FAULT until `bikeped lamp reset`.",
         ),
         _stops("lamp.silent", "light", "The lamp's process does not answer."),
         _minor("camera.moved_slightly", "camera", "The camera has moved a little; align it again."),

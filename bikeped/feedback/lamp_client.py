@@ -74,8 +74,7 @@ class LampClient:
             return Fault("lamp", "lamp.silent", f"its process does not answer{why}")
         latched, error = self._status.get("latched"), self._status.get("error")
         if latched:
-            code = "light.mismatch" if str(latched).startswith("conflict") else "lamp.latched"
-            return Fault("lamp", code, f"{latched}; end it by `bikeped lamp reset`")
+            return Fault("lamp", "lamp.latched", f"{latched}; end it by `bikeped lamp reset`")
         return Fault("light", "light.error", str(error)) if error else None
 
     def close(self, timeout_s: float = 2.0) -> bool:

@@ -271,7 +271,7 @@ def test_the_client_reports_silence_latch_and_device(tmp_path: Path) -> None:
         process.bind(str(tmp_path / "s"))
         for status, code in (
             ({}, None),
-            ({"latched": "conflict: x"}, "light.mismatch"),
+            ({"latched": "conflict: x"}, "lamp.latched"),
             ({"latched": "flicker: x"}, "lamp.latched"),
             ({"error": "unplugged"}, "light.error"),
         ):
