@@ -80,7 +80,7 @@ class FileWatch:
         with self._timeline.open("a") as timeline:
             while not self._ends.wait(0.004):
                 try:
-                    lit = self._state.read_text().split()[0].split("+")
+                    lit = self._state.read_text().split()
                 except (OSError, IndexError):
                     continue
                 colour = next((name for name in COLOURS if name in lit), "off")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import os
 import re
@@ -103,20 +102,17 @@ class Rig:
     def lamp_config(self, more: str = WEB) -> Path:
         """A configuration whose light is a process of its own, which is started, too.
 
-        Its file keeps the lamps' state; a thread notes every change with its time. Where bikeped
-        has no such process, the light is the service's own.
+        Its file keeps the lamp's state; a thread notes every change with its time.
         """
-        if importlib.util.find_spec("bikeped.feedback.lamp") is None:
-            return self.config(more)
         state = self.folder / "lamps"
         lamp = (
-            f"feedback: {{light: lamp}}\nlamp: {{driver: file, file: {state}, "
-            f"socket: {self.folder}/socket, settings: {self.folder}/lamp.json}}\n"
+            "feedback: {light: lamp}\n"
+            f"lamp: {{driver: file, file: {state}, socket: {self.folder}/lamp.socket}}\n"
         )
         config = self.config(more + lamp)
         if not self._lamp_started:
             self._lamp_started = True
-            process = self.popen("lamp", "run", "-c", config)
+            process = self.popen("lamp", "-c", config)
             watch = FileWatch(state, self.light.path)
             self._stack.callback(watch.close)
             self._stack.callback(process.kill)
