@@ -51,6 +51,7 @@ def throttled(rig: Rig) -> None:
     "the light shows FAULT without it; a fresh start",
     "FAULT <= 1 s; restart <= 10 s",
     repeat=20,
+    in_tests=True,
 )
 def killed(rig: Rig) -> None:
     supervisor = rig.supervise(rig.lamp_config())
