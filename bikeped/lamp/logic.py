@@ -4,12 +4,16 @@
 | -------------------------------------------------------------- | ------------------------------ |
 | no heartbeat yet, none for `SILENCE_S`, a malformed one        | FAULT                          |
 | heartbeats again, without a gap for less than `RECOVER_S`      | red if they say so, else FAULT |
-| `FLICKERS` gaps over `GAP_S` within `WINDOW_S`                 | FAULT, latched                 |
+| the same after the n-th silence in ten minutes, for `hold_s`   | FAULT in place of blue, green  |
+| `FLICKERS` gaps over `GAP_S` beside them within `WINDOW_S`     | FAULT, latched                 |
 | another colour, or two, read back for more than `CONFLICT_S`   | FAULT, latched                 |
 | otherwise                                                      | what the heartbeat says        |
 
-FAULT is orange, blinking slowly. What is latched ends by `reset` or at power-on. The service's last
-heartbeat may be `off`: dark claims nothing, so it needs no further heartbeats.
+FAULT is orange, blinking slowly. A service that crashes again and again shows green once: each
+silence lengthens the wait. Gaps count where blue or green was shown, as they were sent: a service
+that stutters while it loads, or a lamp that is late itself, is no flicker. What is latched ends by
+`reset` or at power-on. The service's last heartbeat may be `off`: dark claims nothing, so it needs
+no further heartbeats.
 """
 
 from __future__ import annotations
@@ -21,10 +25,13 @@ from dataclasses import dataclass, field
 
 from bikeped.lamp.colours import Colour
 
+REASSURING = (Colour.BLUE, Colour.GREEN)
+
 SILENCE_S = 0.5
 GAP_S = 0.18  #: the service sends at least every 0.1 s
 FLICKERS, WINDOW_S = 5, 3.0
 RECOVER_S = 1.0
+SILENCES_S = 600.0  #: so long a silence is remembered
 CONFLICT_S = 0.3
 FAULT_BLINK_HZ = 0.5
 MAX_BLINK_HZ = 10.0
@@ -62,6 +69,11 @@ class Heartbeat:
 FAULT = (Colour.ORANGE, FAULT_BLINK_HZ)
 
 
+def hold_s(silences: int) -> float:
+    """How long heartbeats must come before blue or green, after so many silences."""
+    return min(3.0 * 10.0 ** (silences - 1), 300.0) if silences else RECOVER_S
+
+
 @dataclass
 class LampLogic:
     """The state of one lamp since power-on."""
@@ -72,6 +84,7 @@ class LampLogic:
     _heard_s: float = -math.inf
     _since_s: float = -math.inf  # begin of the unbroken run of heartbeats
     _gaps: deque[float] = field(default_factory=lambda: deque(maxlen=FLICKERS))
+    _silences: deque[float] = field(default_factory=lambda: deque(maxlen=4))
     _conflict_s: float | None = None
     _pattern: tuple[Colour, float] = FAULT
     _pattern_s: float = 0.0
@@ -85,11 +98,12 @@ class LampLogic:
             self._gap(now_s)
             self._beat = None
         elif beat.sent_s > self._sent_s and 0 <= now_s - beat.sent_s < SILENCE_S:
-            if self._beat is None or now_s - self._heard_s >= SILENCE_S:
-                if self._beat is not None and self._beat.colour is not Colour.OFF:
-                    self._gap(now_s)
+            before, gap_s = self._beat, beat.sent_s - self._sent_s
+            if before is None or now_s - self._heard_s >= SILENCE_S:
+                if before is not None and before.colour is not Colour.OFF:
+                    self._silences.append(now_s)
                 self._since_s = now_s
-            elif now_s - self._heard_s > GAP_S:
+            if before is not None and before.colour in REASSURING and gap_s > GAP_S:
                 self._gap(now_s)
             self._beat, self._sent_s, self._heard_s = beat, beat.sent_s, now_s
 
@@ -111,6 +125,10 @@ class LampLogic:
         """Ends what is latched; the heartbeats must prove themselves anew."""
         self.latched = self._conflict_s = self._beat = None
         self._gaps.clear()
+        self._silences.clear()
+
+    def _held_until_s(self, now_s: float) -> float:
+        return self._since_s + hold_s(sum(now_s - at_s < SILENCES_S for at_s in self._silences))
 
     def fault(self, now_s: float) -> str | None:
         """Why FAULT is shown at `now_s` whatever the service says; None when it is heard."""
@@ -124,6 +142,8 @@ class LampLogic:
             return f"no heartbeat for {SILENCE_S:g} s"
         if now_s - self._since_s < RECOVER_S and self._beat.colour is not Colour.RED:
             return "heartbeats are coming again"
+        if self._beat.colour in REASSURING and now_s < self._held_until_s(now_s):
+            return "no blue or green yet: the service fell silent before"
         return None
 
     def shows(self, now_s: float) -> tuple[Colour, float]:
@@ -136,7 +156,7 @@ class LampLogic:
         if pattern != self._pattern:
             self._pattern, self._pattern_s = pattern, now_s
         colour, blink_hz = pattern
-        limits_s = [self._heard_s + SILENCE_S, self._since_s + RECOVER_S]
+        limits_s = [self._heard_s + SILENCE_S, self._since_s + RECOVER_S, self._held_until_s(now_s)]
         if blink_hz > 0 and colour is not Colour.OFF:
             # The epsilon keeps a wake-up at the very edge on the far side of it.
             half = int((now_s - self._pattern_s) * 2 * blink_hz + 1e-6)

@@ -9,9 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.lamp.colours import Colour
-from bikeped.lamp.logic import CONFLICT_S, GAP_S, RECOVER_S, SILENCE_S, Heartbeat, LampLogic
-
-REASSURING = (Colour.GREEN, Colour.BLUE)
+from bikeped.lamp.logic import (
+    CONFLICT_S,
+    GAP_S,
+    REASSURING,
+    RECOVER_S,
+    SILENCE_S,
+    Heartbeat,
+    LampLogic,
+    hold_s,
+)
 
 
 def beat(logic: LampLogic, now_s: float, colour: Colour = Colour.GREEN, hz: float = 0.0) -> None:
@@ -79,6 +86,66 @@ def test_heartbeats_that_come_and_go_latch_within_three_seconds(on_s: float, off
     logic.reset()
     now_s = steady(logic, now_s, now_s + RECOVER_S + 0.2)
     assert logic.shows(now_s)[0] is Colour.GREEN
+
+
+def test_a_service_that_stutters_while_it_loads_is_no_flicker() -> None:
+    logic = LampLogic()
+    for step in range(50):
+        beat(logic, step * 0.3, Colour.ORANGE, 0.5)
+    assert logic.latched is None
+
+
+def test_a_lamp_that_is_late_itself_sees_no_flicker() -> None:
+    logic = LampLogic()
+    now_s = steady(logic, 0.0, 2.0)
+    for step in range(100):  # three heartbeats at a time, each 0.3 s
+        for late_s in (0.2, 0.1, 0.0):
+            at_s = now_s + step * 0.3
+            logic.heartbeat(Heartbeat(at_s - late_s, Colour.GREEN, 0.0), at_s)
+    assert logic.latched is None
+    assert logic.shows(at_s)[0] is Colour.GREEN
+
+
+def test_each_further_silence_holds_green_back_longer() -> None:
+    logic = LampLogic()
+    now_s = steady(logic, 0.0, 2.0)
+    assert [hold_s(count) for count in range(5)] == [1.0, 3.0, 30.0, 300.0, 300.0]
+    for silences in (1, 2, 3):
+        began_s = now_s + 1.0
+        now_s = steady(logic, began_s, began_s + hold_s(silences) - 0.2)
+        assert logic.fault(now_s - 0.05) == "no blue or green yet: the service fell silent before"
+        assert logic.shows(now_s - 0.05)[0] is not Colour.GREEN
+        beat(logic, now_s, Colour.RED)  # warnings do not wait
+        assert logic.shows(now_s)[0] is Colour.RED
+        now_s = steady(logic, now_s + 0.05, now_s + 0.4)
+        assert logic.shows(now_s - 0.05)[0] is Colour.GREEN
+
+
+def test_old_silences_are_forgotten_and_a_reset_forgets_all() -> None:
+    logic = LampLogic()
+    steady(logic, 0.0, 2.0)
+    steady(logic, 10.0, 40.0)
+    now_s = steady(logic, 700.0, 702.0)
+    assert logic.shows(now_s)[0] is not Colour.GREEN  # of this one silence, 3 s
+    now_s = steady(logic, now_s, 703.2)
+    assert logic.shows(now_s)[0] is Colour.GREEN
+    steady(logic, 710.0, 712.0)
+    logic.reset()
+    now_s = steady(logic, 712.1, 713.3)
+    assert logic.shows(now_s)[0] is Colour.GREEN
+
+
+def test_a_crash_loop_shows_green_in_its_first_life_only() -> None:
+    logic, now_s, green = LampLogic(), 0.0, 0
+    for _ in range(10):  # lives of 2.5 s, and 5 s to start again
+        end_s = now_s + 2.5
+        while now_s < end_s:
+            beat(logic, now_s)
+            shown = logic.shows(now_s)[0]
+            now_s += 0.05
+        green += shown is Colour.GREEN
+        now_s += 5.0
+    assert green == 1
 
 
 def test_jitter_is_no_flicker() -> None:
