@@ -31,7 +31,7 @@ def claims_of(loaded: LoadedConfig) -> dict[str, str]:
     held = {}
     if Path(loaded.source).is_file():
         held[loaded.source] = str(Path(loaded.source).resolve())
-    driver = getattr(feedback, feedback.light, None)
+    driver = getattr(loaded.config if feedback.light == "lamp" else feedback, feedback.light, None)
     if driver is not None:  # lamps that are wired
         settings = msgspec.json.encode(driver, order="deterministic").decode()
         held[f"the {feedback.light} light"] = f"{feedback.light} {settings}"

@@ -24,6 +24,8 @@ def test_what_is_held_is_the_file_the_wired_light_and_the_camera_device(small_co
     assert claims_of(load_config(config, ["camera.source='7'"]))["/dev/video7"] == "/dev/video7"
     rehearsal = load_config(config, ["camera.source=day.avi", "feedback.light=simulated"])
     assert set(claims_of(rehearsal)) == {str(config)}
+    lamp = load_config(config, ["feedback.light=lamp", "lamp.driver=gpio"])
+    assert "/run/bikeped/lamp.socket" in claims_of(lamp)["the lamp light"]
 
 
 async def test_a_claim_is_exclusive_names_its_holder_and_ends(small_config, tmp_path):
