@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
+import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -172,11 +174,14 @@ def write_outputs(
 
 def camera_config(config_path: Path | None, overrides: tuple[str, ...]) -> LoadedConfig:
     """The configuration with a stand-in for its calibration file, which may not exist yet."""
+    # Any lens that makes sense in the crop, whose size only the configuration knows.
+    lens = ("camera.calibration=null", "camera.radius_px=1000", "camera.fov_deg=180")
+    width, height = framing(load_config(config_path, (*overrides, *lens))).crop_wh
+    middle = {"model": "equidistant", "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    middle |= {"focal_length": min(width, height) / math.pi, "fov_deg": 180}
     with tempfile.TemporaryDirectory() as folder:
         stand_in = Path(folder) / "stand-in.json"
-        stand_in.write_text(
-            '{"model": "equidistant", "cx": 0, "cy": 0, "focal_length": 1, "fov_deg": 180}'
-        )
+        stand_in.write_text(json.dumps(middle))
         return load_config(config_path, (*overrides, f"camera.calibration={stand_in}"))
 
 

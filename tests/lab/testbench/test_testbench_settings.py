@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from testbench_fakes import BASE, MARKUP, OWN, bench, pages
 
+from bikeped.config.json_schema import key_descriptions
 from bikeped.config.schema import DecisionConfig
 from bikeped.errors import BikepedError, ScenarioError
 from bikeped.lab.testbench.pages import JobQueue, ranges
@@ -157,7 +158,7 @@ def test_the_page_s_ranges_are_those_that_are_checked():
     assert told["decision.memory_frames"] == {
         "low": 0,
         "high": 3000,
-        "meaning": "N: a cyclist is remembered this many nominal frames",
+        "meaning": key_descriptions(DecisionConfig)["memory_frames"],
         "whole": True,
     }
     for key, one in told.items():
