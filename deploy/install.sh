@@ -162,7 +162,8 @@ install_config() {
 
 install_files() {
   run mkdir -p "$opt/share" "$prefix/etc/systemd/system" "$prefix/etc/udev/rules.d"
-  run install -m 0644 "$source_dir/deploy/bikeped.service" "$prefix/etc/systemd/system/"
+  run install -m 0644 "$source_dir/deploy/bikeped.service" \
+    "$source_dir/deploy/bikeped-lamp.service" "$prefix/etc/systemd/system/"
   run install -m 0644 "$source_dir/deploy/99-bikeped.rules" "$prefix/etc/udev/rules.d/"
   if [[ -f "$source_dir/docs/install-on-a-pole.md" ]]; then
     run install -m 0644 "$source_dir/docs/install-on-a-pole.md" "$opt/share/"
@@ -203,9 +204,9 @@ restart_service() {
   on_system systemctl daemon-reload
   on_system udevadm control --reload-rules
   on_system udevadm trigger
-  on_system systemctl enable "$SERVICE"
+  on_system systemctl enable "$SERVICE" "$SERVICE-lamp"
   if [[ "$start" == yes ]]; then
-    on_system systemctl restart "$SERVICE"
+    on_system systemctl restart "$SERVICE-lamp" "$SERVICE"
   fi
 }
 
@@ -226,7 +227,7 @@ next_steps() {
 Done. Next:
   1. edit $config (camera height and pitch, model file, lamps)
   2. $current/bin/bikeped config check -c $config
-  3. sudo systemctl restart $SERVICE
+  3. sudo systemctl restart $SERVICE-lamp $SERVICE
   4. journalctl -u $SERVICE -f
 Back to the release before this one: sudo $0 --rollback
 NEXT
@@ -244,7 +245,7 @@ if [[ "$rollback" == yes ]]; then
   point "$current" "$back"
   point "$previous" "$was"
   if [[ "$start" == yes ]]; then
-    on_system systemctl restart "$SERVICE"
+    on_system systemctl restart "$SERVICE-lamp" "$SERVICE"
   fi
   say "Back to $back; the release left is $was"
   exit 0

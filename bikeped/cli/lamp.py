@@ -19,18 +19,18 @@ from bikeped.feedback.lamp_client import ask_lamp, write_settings
 @click.group("lamp", invoke_without_command=True)
 @config_options
 @click.option("--write", type=PATH, help="Only write the settings of the process to this file.")
-@click.pass_context
 @guarded
-def command(
-    context: click.Context, config_path: Path | None, overrides: tuple[str, ...], write: Path | None
-) -> None:
+def command(config_path: Path | None, overrides: tuple[str, ...], write: Path | None) -> None:
     """Drive the lamp by the service's heartbeats, where feedback.light is lamp."""
+    context = click.get_current_context()
     if context.invoked_subcommand is not None:
         context.obj = (config_path, overrides)
         return
     loaded = load_config(config_path, overrides)
     feedback, lamp = loaded.config.feedback, loaded.config.lamp
     if feedback.light != "lamp":
+        if write is not None:  # settings of old would take the lines from the service
+            write.unlink(missing_ok=True)
         raise ConfigError(f"{loaded.source}: feedback.light is {feedback.light}; set it to lamp")
     check_light(feedback, lamp)
     path = write or Path(lamp.socket).with_name("lamp.json")
@@ -42,11 +42,10 @@ def command(
 
 @command.command("reset")
 @config_options
-@click.pass_context
 @guarded
-def reset(context: click.Context, config_path: Path | None, overrides: tuple[str, ...]) -> None:
+def reset(config_path: Path | None, overrides: tuple[str, ...]) -> None:
     """End what the lamp has latched; its cause should be found first."""
-    above = context.obj or (None, ())
+    above = click.get_current_context().obj or (None, ())
     loaded = load_config(config_path or above[0], (*above[1], *overrides))
     status = ask_lamp(loaded.config.lamp.socket, {"reset": True})
     click.echo(f"the lamp is reset; it shows {status.get('colour')}")

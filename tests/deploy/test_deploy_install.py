@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 INSTALL = ROOT / "deploy" / "install.sh"
 UNIT = ROOT / "deploy" / "bikeped.service"
+LAMP_UNIT = ROOT / "deploy" / "bikeped-lamp.service"
 RULES = ROOT / "deploy" / "99-bikeped.rules"
 
 # Stands for python3: makes a "virtual environment" whose programs note how they were called.
@@ -87,6 +88,7 @@ def test_installs_everything_below_the_prefix_and_leaves_the_machine_alone(bench
     done = bench.run()
     etc = bench.prefix / "etc"
     assert (etc / "systemd/system/bikeped.service").read_text() == UNIT.read_text()
+    assert (etc / "systemd/system/bikeped-lamp.service").read_text() == LAMP_UNIT.read_text()
     assert (etc / "udev/rules.d/99-bikeped.rules").read_text() == RULES.read_text()
     assert (etc / "bikeped/config.yaml").read_text() == (ROOT / "config.yaml").read_text()
     assert (bench.prefix / "var/lib/bikeped").is_dir()
@@ -138,7 +140,7 @@ def test_dry_run_without_a_prefix_names_every_change_of_the_machine(bench: Bench
         "/etc/udev/rules.d/",
         "runuser -u bikeped -- /opt/bikeped/venv/bin/bikeped doctor",
         "systemctl enable bikeped",
-        "systemctl restart bikeped",
+        "systemctl restart bikeped-lamp bikeped",
     ):
         assert step in done.stdout
 
@@ -297,10 +299,11 @@ def test_the_unit_does_not_lock_cuda_or_usb_out() -> None:
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
-def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
+@pytest.mark.parametrize("file", [UNIT, LAMP_UNIT])
+def test_systemd_accepts_the_unit(tmp_path: Path, file: Path) -> None:
     # The programs of a pole are not on the tester's machine: any program stands for them.
-    unit = tmp_path / "bikeped.service"
-    unit.write_text(re.sub(r"=(-?)/opt/bikeped/venv/bin/\S+", r"=\1/bin/true", UNIT.read_text()))
+    unit = tmp_path / file.name
+    unit.write_text(re.sub(r"=(-?)/opt/bikeped/venv/bin/\S+", r"=\1/bin/true", file.read_text()))
     done = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", str(unit)],
         capture_output=True,
@@ -308,7 +311,7 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
         check=False,
     )
     complaints = [
-        line for line in done.stderr.splitlines() if "bikeped.service" in line or str(unit) in line
+        line for line in done.stderr.splitlines() if file.name in line or str(unit) in line
     ]
     assert complaints == []
 

@@ -29,6 +29,7 @@ COMMANDS = {
     "demo",
     "config",
     "doctor",
+    "lamp",
     "calibrate",
     "conformance",
     "model",
@@ -42,10 +43,10 @@ def test_every_key_exists(key: str) -> None:
         section = {field.name: field.type for field in msgspec.structs.fields(section)}[part]
 
 
-def test_the_example_is_a_configuration() -> None:
-    (example,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
-    config = msgspec.yaml.decode(example, type=Config)
-    assert config.feedback.light == "gpio"
+def test_the_examples_are_configurations() -> None:
+    examples = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    configs = [msgspec.yaml.decode(example, type=Config) for example in examples]
+    assert [config.feedback.light for config in configs] == ["gpio", "lamp"]
 
 
 def test_only_commands_of_the_interface_are_used() -> None:
