@@ -29,8 +29,9 @@ _FLAT = (
     3.0,
     8.0,
 )  #: grey levels between the tiles of a dark, and of another, picture of one colour
+_FLAT_PART = 4.0  #: the same, where much of the picture is black
 _DARK, _BRIGHT, _BORDER = 20.0, 235.0, 8.0
-_LOST = 0.5  #: of the known structures (`KnownScene`)
+_LOST = 0.45  #: of the known structures (`KnownScene`)
 _BLURRED = 1.25  #: sharpness (`Sharpness`) that is too little at any site
 _BLURRED_SHARE = 0.4  #: of the site's own above 1
 _UNDEREXPOSED = 25.0  #: grey levels of the brightest tenth
@@ -117,11 +118,14 @@ class PictureHealth:
             self._scene = KnownScene(picture.coarse, region)
         levels = tiles(picture.coarse.astype(np.float32))
         grid_means = levels.mean(axis=-1)
-        means = grid_means[_lit(grid_means, region)]
+        lit = _lit(grid_means, region)
+        means = grid_means[lit]
         levels = levels[region]
         low, middle, high = np.quantile(means, (0.01, 0.5, 0.99)).tolist()
         spread = high - low
         flat = _FLAT[0] if middle < _DARK else _FLAT[1]
+        if lit.sum() < region.sum():  # a part of a picture is more even than a whole one
+            flat = min(flat, _FLAT_PART)
         # As a share, so that larger is worse: 1 is as even as a picture of one colour.
         even = flat / max(spread, 0.01)
         before = {v.code: v for v in self._verdicts}

@@ -23,6 +23,8 @@ _SHARP = 1.3  #: a part that has been sharper than this can be seen to lose it
 #: A part is blurred below these shares, of its usual sharpness and of its usual energy of fine
 #: slopes; both in proportion to the whole picture's: light and weather change them everywhere.
 _PART_SHARP, _PART_LEFT = 0.85, 0.65
+_ABOVE_NOISE = 1.0  #: energy of a part that can be judged, over that of noise and rain
+_SMOOTH = 0.2  #: of the newest noise in its mean
 _FEW = 8
 _KNOWN_S = 2.0
 _FORGET_S = 60.0
@@ -39,6 +41,7 @@ class Sharpness:
         self._before: list[Float32Array] = []
         self._energy = np.zeros((2, *GRID), np.float32)
         self._parts = np.zeros((2, *GRID), np.float32)
+        self._noise = 0.0  #: energy of the fine slopes that two pictures do not have in common
         self._pictures = 0
         self._seen_s = 0.0
         self._usual = 1.0
@@ -90,6 +93,7 @@ class Sharpness:
         usual_fine, usual_wide = self._usual_energy
         usual_part = usual_fine / np.maximum(usual_wide, 1e-6)
         judged = self._strong(usual_wide) & (usual_part >= _SHARP)
+        judged &= usual_fine >= _ABOVE_NOISE * self._noise
         if self._seen_s < _KNOWN_S or judged.sum() < _FEW:
             return float("nan"), np.zeros(GRID, np.bool_)
         whole = min(1.0, max(sharp - 1.0, 0.0) / max(self._usual - 1.0, 1e-3))
@@ -111,6 +115,8 @@ class Sharpness:
         if self._before:
             pairs = zip(slopes, self._before, strict=True)
             energy = np.stack([_common_energy(now, before) for now, before in pairs])
+            noise = float(cv2.norm(slopes[0], cv2.NORM_L2SQR)) / slopes[0].size - energy[0].mean()
+            self._noise += _SMOOTH * (noise / self._region.mean() - self._noise)
             for mean, time_s in ((self._energy, _SMOOTH_S), (self._parts, _PARTS_SMOOTH_S)):
                 first = self._pictures == 1
                 mean += np.float32(1.0 if first else 1.0 - np.exp(-passed_s / time_s)) * (
