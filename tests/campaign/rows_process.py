@@ -100,7 +100,7 @@ def stopped(rig: Rig) -> None:
 def crash_loop(rig: Rig) -> None:
     rig.control("later-kill 1.5")
     supervisor = rig.supervise(rig.lamp_config(), seam="detector")
-    while len(supervisor.ends) < 10 and time.monotonic() - supervisor.began_s < 180:
+    while len(supervisor.ends) < 10 and time.monotonic() - supervisor.began_s < 900:
         time.sleep(0.2)
     ends = [at_s for at_s, _ in supervisor.ends]
     if rig.expect(len(ends) >= 10, f"only {len(ends)} crashes"):
@@ -165,7 +165,9 @@ def broken_configuration(rig: Rig) -> None:
     good = config.read_text()
     supervisor = rig.supervise(config)
     rig.ready(supervisor.began_s, name=None)
-    time.sleep(1)
+    deadline_s = time.monotonic() + 180
+    while "kept in" not in supervisor.log.read_text() and time.monotonic() < deadline_s:
+        time.sleep(0.2)
     for _ in rig.repetitions:
         config.write_text(good[: len(good) // 2] + "\n  nonsense: [\n")
         process = supervisor.process
