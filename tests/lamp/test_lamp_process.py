@@ -15,10 +15,11 @@ from typing import Any
 
 import pytest
 
+from bikeped.config.output_sections import FeedbackConfig, LampConfig
 from bikeped.errors import FeedbackError
-from bikeped.feedback.lamp_client import LampClient, ask_lamp
+from bikeped.feedback.lamp_client import LampClient, ask_lamp, write_settings
 from bikeped.lamp.colours import Colour
-from bikeped.lamp.process import LampDevice, LampProcess, open_device
+from bikeped.lamp.process import LampDevice, LampProcess, notify, open_device
 from bikeped.types import Signal
 
 ROOT = Path(__file__).parents[2]
@@ -287,3 +288,67 @@ def test_the_client_reports_silence_latch_and_device(tmp_path: Path) -> None:
         assert not client.close()  # the last status is an error
     client.show(GREEN)
     assert client.close() is False
+
+
+def test_one_step_answers_resets_and_keeps_what_is_latched(tmp_path: Path) -> None:
+    latch = tmp_path / "s.latched"
+    latch.write_text("conflict: two colours")
+    settings = {"driver": "file", "file": str(tmp_path / "lamp"), "socket": str(tmp_path / "s")}
+    lamp = LampProcess(settings)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
+        asking.settimeout(PATIENCE_S)
+        asking.bind(str(tmp_path / "me"))
+        asking.sendto(b'{"status": true}', settings["socket"])
+        lamp.serve()
+        assert json.loads(asking.recv(4096))["latched"] == "conflict: two colours"
+        asking.sendto(b'{"reset": true}', settings["socket"])
+        lamp.serve()
+        assert json.loads(asking.recv(4096))["latched"] is None
+        lamp.serve()
+        assert not latch.exists()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as nameless:
+        for _ in range(40):  # more than are read at once; there is nobody to answer
+            nameless.sendto(b"rubbish", settings["socket"])
+            lamp.serve()
+    lamp.serve()
+    assert latch.read_text().startswith("flicker")
+    assert (tmp_path / "lamp").read_text().strip() in ("orange", "off")
+    lamp.close()
+    assert (tmp_path / "lamp").read_text() == "off\n"
+
+
+def test_a_lamp_that_was_never_opened_is_closed_and_says_its_error_once(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    settings = {
+        "driver": "file",
+        "file": str(tmp_path / "none" / "f"),
+        "socket": str(tmp_path / "s"),
+    }
+    clock = iter(range(0, 1000, 5))
+    lamp = LampProcess(settings, clock=lambda: float(next(clock)))
+    for _ in range(3):
+        lamp.serve()
+    assert "lamp.file" in str(lamp.status()["error"])
+    lamp.close()
+    assert capfd.readouterr().err.count("the light cannot be driven") == 1
+
+
+@pytest.mark.parametrize("driver", ["file", "gpio", "usb"])
+def test_the_settings_hold_what_the_driver_needs(tmp_path: Path, driver: str) -> None:
+    path = tmp_path / "lamp.json"
+    lamp = LampConfig(driver=driver, file="/tmp/f")  # type: ignore[arg-type]
+    write_settings(path, lamp, FeedbackConfig())
+    settings = json.loads(path.read_text())
+    assert settings.keys() == {"driver", "socket", driver}
+
+
+def test_the_service_manager_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.settimeout(PATIENCE_S)
+        manager.bind(str(tmp_path / "n"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "n"))
+        notify("READY=1")
+        assert manager.recv(64) == b"READY=1"
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    notify("READY=1")
