@@ -18,7 +18,7 @@ from typing import Protocol, TypeVar
 from bikeped.errors import FeedbackError
 from bikeped.faults import Fault
 from bikeped.feedback.signal_logic import fault_signal
-from bikeped.lamp.colours import Colour, Light
+from bikeped.lamp.colours import Colour, Light, blinked
 from bikeped.types import Signal
 
 _log = logging.getLogger(__name__)
@@ -160,7 +160,7 @@ class LightDriver:
         if _pattern_of(signal) != self._pattern:
             self._pattern = _pattern_of(signal)
             self._pattern_s = now_s
-        colour, edge_s = _phase(self._pattern, self._pattern_s, now_s)
+        colour, edge_s = blinked(*self._pattern, self._pattern_s, now_s)
         due_s = min(edge_s, trips_at_s, self._apply(colour, now_s))
         # Said once the light is set, and outside the lock: a log that blocks must block neither.
         tripped, before = self._to_say
@@ -265,17 +265,3 @@ class LightDriver:
 
 def _pattern_of(signal: Signal) -> tuple[Colour, float]:
     return signal.colour, signal.blink_hz
-
-
-def _phase(pattern: tuple[Colour, float], since_s: float, now_s: float) -> tuple[Colour, float]:
-    """The colour of a pattern that began at `since_s`, and when it changes next.
-
-    Blinking is lit for the first half of each period, so a new signal shows at once.
-    """
-    colour, blink_hz = pattern
-    if blink_hz <= 0 or colour is Colour.OFF:
-        return colour, float("inf")
-    half_s = 0.5 / blink_hz
-    # The epsilon keeps a wake-up that comes at the very edge on the far side of it.
-    half = int((now_s - since_s) / half_s + 1e-6)
-    return (colour if half % 2 == 0 else Colour.OFF), since_s + (half + 1) * half_s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import itertools
+import math
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -38,6 +39,19 @@ class Light(Protocol):
 
     def close(self) -> None:
         """Switches off and releases the device."""
+
+
+def blinked(colour: Colour, blink_hz: float, since_s: float, now_s: float) -> tuple[Colour, float]:
+    """The colour at `now_s` of a pattern that began at `since_s`, and when it changes next.
+
+    Blinking is lit for the first half of each period, so a new pattern shows at once.
+    """
+    if blink_hz <= 0 or colour is Colour.OFF:
+        return colour, math.inf
+    half_s = 0.5 / blink_hz
+    # The epsilon keeps a wake-up that comes right at an edge on the far side of it.
+    half = int((now_s - since_s) / half_s + 1e-6)
+    return (colour if half % 2 == 0 else Colour.OFF), since_s + (half + 1) * half_s
 
 
 def assign_lamps(wired: Mapping[Colour, Lamp], section: str) -> dict[Colour, Lamp]:

@@ -23,7 +23,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from bikeped.lamp.colours import Colour
+from bikeped.lamp.colours import Colour, blinked
 
 REASSURING = (Colour.BLUE, Colour.GREEN)
 
@@ -155,11 +155,7 @@ class LampLogic:
             pattern = (beat.colour, beat.blink_hz)
         if pattern != self._pattern:
             self._pattern, self._pattern_s = pattern, now_s
-        colour, blink_hz = pattern
-        limits_s = [self._heard_s + SILENCE_S, self._since_s + RECOVER_S, self._held_until_s(now_s)]
-        if blink_hz > 0 and colour is not Colour.OFF:
-            # The epsilon keeps a wake-up at the very edge on the far side of it.
-            half = int((now_s - self._pattern_s) * 2 * blink_hz + 1e-6)
-            limits_s.append(self._pattern_s + (half + 1) / (2 * blink_hz))
-            colour = colour if half % 2 == 0 else Colour.OFF
+        colour, edge_s = blinked(*pattern, self._pattern_s, now_s)
+        silent_s, recovered_s = self._heard_s + SILENCE_S, self._since_s + RECOVER_S
+        limits_s = (edge_s, silent_s, recovered_s, self._held_until_s(now_s))
         return colour, min((at_s for at_s in limits_s if at_s > now_s), default=math.inf)
