@@ -34,13 +34,13 @@ def guarded(command: F) -> F:
     """
 
     @functools.wraps(command)
-    def checked(*context: Any, **given: Any) -> Any:  # click.pass_context gives one
+    def checked(**given: Any) -> Any:
         parameters = {p.name: p for p in click.get_current_context().command.params}
         read = ((parameters[k], path) for k in _INPUTS for path in _read_paths(given.get(k)))
         files = ((parameters[k], path) for k in _OUTPUTS for path in written_paths(given.get(k)))
         written = [(_label(p), path) for p, path in files if not _is_folder(p, given)]
         check_outputs([(_label(p), path) for p, path in read], written)
-        return command(*context, **given)
+        return command(**given)
 
     return checked  # type: ignore[return-value]
 

@@ -84,8 +84,8 @@ class FaultMonitor:
 
     def faults(self, now_s: float) -> tuple[Fault, ...]:
         """The faults that the light shows; empty when the decision holds."""
-        checks = [f for f in self.picture.faults() if f.kind.effect is not Effect.NOTICE]
         if not self._feed.live:
+            checks = self._from_checks(Effect.FAULT, Effect.WITHHELD)
             return (*checks, *self._from_sources(Effect.WITHHELD))
         error, limits = self._feed.error, self._limits
         faults: list[Fault | None] = [
@@ -94,21 +94,24 @@ class FaultMonitor:
             *self._failed("camera.frame_size"),
             None if error is None else Fault("camera", "camera.error", str(error)),
             *self._from_sources(Effect.FAULT),
-            *(fault for fault in checks if fault.kind.effect is Effect.FAULT),
+            *self._from_checks(Effect.FAULT),
         ]
         if any(faults):  # the cause, where a stage fails; one bad frame among good ones is no fault
             faults += self._failed("camera.undecodable", "detector.error")
         faults += self._from_sources(Effect.WITHHELD)
-        faults += (fault for fault in checks if fault.kind.effect is Effect.WITHHELD)
+        faults += self._from_checks(Effect.WITHHELD)
         return tuple(fault for fault in faults if fault is not None)
 
     def notices(self) -> tuple[Fault, ...]:
         """The faults that leave the light as decided."""
-        checks = (f for f in self.picture.faults() if f.kind.effect is Effect.NOTICE)
-        return (*checks, *self._pace.faults, *self._from_sources(Effect.NOTICE))
+        pace = self._pace.faults
+        return (*self._from_checks(Effect.NOTICE), *pace, *self._from_sources(Effect.NOTICE))
 
     def _failed(self, *codes: str) -> list[Fault]:
         return [self._failures[code].fault for code in codes if code in self._failures]
+
+    def _from_checks(self, *effects: Effect) -> Iterable[Fault]:
+        return (fault for fault in self.picture.faults() if fault.kind.effect in effects)
 
     def _from_sources(self, effect: Effect) -> Iterable[Fault]:
         faults = (source() for source in self._sources)

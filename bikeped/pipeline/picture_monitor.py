@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from bikeped.config.build import framing, ground_camera
 from bikeped.config.load import LoadedConfig
 from bikeped.errors import ConfigError, GeometryError
-from bikeped.faults import Effect, Fault
+from bikeped.faults import FAULT_KINDS, Effect, Fault
 from bikeped.monitor.camera_drift import Drift, DriftCheck
 from bikeped.monitor.drift_reference import DriftReference
 from bikeped.monitor.picture_health import PictureHealth
@@ -60,7 +60,7 @@ class PictureMonitor:
             verdicts = self._health.update(rgb, time_s)
             # A picture that cannot be trusted says nothing of the camera's place.
             trusted = not any(
-                (v.active or v.beyond) and Fault("picture", v.code, "").kind.effect != Effect.NOTICE
+                (v.active or v.beyond) and FAULT_KINDS[v.code].effect is not Effect.NOTICE
                 for v in verdicts
             )
             if trusted and time_s >= self._drift_s + DRIFT_EVERY_S:

@@ -164,9 +164,14 @@ async def _show_for(
     until_s = time.monotonic() + seconds
     while time.monotonic() < until_s and not stop.is_set():
         light.show(signal)
-        notify("EXTEND_TIMEOUT_USEC=30000000", "WATCHDOG=1", "STATUS=waiting in FAULT")
+        _still_starting("waiting in FAULT")
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(stop.wait(), _REFRESH_S)
+
+
+def _still_starting(status: str) -> None:
+    """Asks systemd for half a minute more."""
+    notify("EXTEND_TIMEOUT_USEC=30000000", "WATCHDOG=1", f"STATUS={status}")
 
 
 def _open_camera(loaded: LoadedConfig) -> FrameSource:
@@ -191,7 +196,7 @@ async def _load_while_alive(
         while not (loading.done() or stop.is_set()):
             light.show(starting)
             if time.monotonic() - began_s < LOAD_LIMIT_S:
-                notify("EXTEND_TIMEOUT_USEC=30000000", "WATCHDOG=1", "STATUS=loading the model")
+                _still_starting("loading the model")
             await asyncio.wait({loading}, timeout=_REFRESH_S)
         return await loading if loading.done() else None
     finally:

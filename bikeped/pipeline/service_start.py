@@ -17,7 +17,7 @@ from bikeped.config.last_good import LastGood, load_runnable
 from bikeped.config.load import LoadedConfig
 from bikeped.errors import BikepedError
 from bikeped.faults import Fault
-from bikeped.files import make_folder, read_regular, write_synced
+from bikeped.files import WholeFile, make_folder, read_regular, write_synced
 from bikeped.types import Signal
 
 log = logging.getLogger(__name__)
@@ -63,10 +63,9 @@ class EarlyEnds:
         self._write(0)
 
     def _write(self, number: int) -> None:
-        partial_path = self._path.with_suffix(".new")
         try:
-            write_synced(partial_path, json.dumps({"early_ends": number}).encode())
-            partial_path.replace(self._path)
+            with WholeFile(self._path) as partial_path:
+                write_synced(partial_path, json.dumps({"early_ends": number}).encode())
         except OSError as error:
             log.warning("%s: cannot be written (%s)", self._path, error.strerror)
 
