@@ -112,10 +112,9 @@ class Rig:
         config = self.config(more + lamp)
         if not self._lamp_started:
             self._lamp_started = True
-            process = self.popen("lamp", "-c", config)
+            self.popen("lamp", "-c", config)
             watch = FileWatch(state, self.light.path)
             self._stack.callback(watch.close)
-            self._stack.callback(process.kill)
         return config
 
     def popen(self, *arguments: object, **options: Any) -> subprocess.Popen[bytes]:
@@ -127,6 +126,7 @@ class Rig:
                 cwd=self.folder,
                 **{"stdout": log, "stderr": log, **options},
             )
+        self._stack.callback(process.wait)  # after its end, which comes first: LIFO
         self._stack.callback(process.kill)
         return process
 
