@@ -1,7 +1,7 @@
-"""Log lines through a bounded queue, so that a standard error that blocks blocks nobody.
+"""Log lines through a bounded queue, so that a blocked standard error blocks no other thread.
 
-A pipe that nobody reads, or a journal that hangs, stops a `write` for ever. Only one daemon thread
-of this module writes; whoever logs puts a line into a queue, and loses it when the queue is full.
+A pipe without a reader, or a journal that hangs, stops a `write` for ever. Only one daemon thread
+of this module writes; a logging call puts its line into a queue, and drops it when that is full.
 When there is room again, one line names how many were lost.
 """
 

@@ -72,7 +72,7 @@ from bikeped.web.server import serve_pages
     "check_path",
     type=click.Path(path_type=Path, dir_okay=False),
     help="Save FRAME (.jpg) with the road users that the model finds in it, without a browser, to "
-    "check the model with (detection.check_picture). It shows whoever is in FRAME.",
+    "check the model with (detection.check_picture). It shows the people in FRAME.",
 )
 @json_option
 @guarded
@@ -154,8 +154,8 @@ def _save_check_picture(loaded: LoadedConfig, frame: Frame, path: Path) -> int:
     found = known_answers(pool.detect(decoded).detections, loaded.config.detection.confidence)
     if not len(found):
         raise BikepedError(
-            f"--check-picture {path}: the model finds nobody in FRAME with much confidence; take "
-            "one with a pedestrian and a cyclist near the pole"
+            f"--check-picture {path}: the model finds no person in FRAME with much confidence; "
+            "take one with a pedestrian and a cyclist near the pole"
         )
     box_px = found.box_px * np.float32(decoded.rgb.shape[1] / frame.width)
     write_check_picture(path, decoded.rgb, replace(found, box_px=box_px), pool.model_hash)

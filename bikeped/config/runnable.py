@@ -40,8 +40,8 @@ def check_runnable(loaded: LoadedConfig) -> None:
             )
     if config.decision.memory_frames < 1:
         raise ConfigError(
-            f"{loaded.source}: decision.memory_frames: 0 remembers nobody: a cyclist who is missed "
-            "in one frame warns nobody; use 1 or more (0 is for bikeped conformance)"
+            f"{loaded.source}: decision.memory_frames: 0 remembers no cyclist: one that is missed "
+            "in a single frame gives no warning; use 1 or more (0 is for bikeped conformance)"
         )
     try:
         check_gain(ground_camera(loaded).lens)

@@ -202,7 +202,7 @@ class LampProcess:
 
 
 def bind(path: Path) -> socket.socket:
-    """The socket at `path`, in place of one that nobody serves; FeedbackError otherwise."""
+    """The socket at `path`, in place of one that no process serves; FeedbackError otherwise."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
     try:
         with contextlib.suppress(FileNotFoundError, ConnectionRefusedError):
@@ -256,7 +256,7 @@ def main(arguments: list[str]) -> int:
                 try:
                     lamp = LampProcess(json.loads(path.read_bytes()))
                 except (OSError, ValueError, KeyError, TypeError, FeedbackError) as error:
-                    # Nothing can be driven before somebody says what: wait, and say so once.
+                    # Without settings there is nothing to drive: wait, and say so once.
                     if str(error) != said:
                         said = str(error)
                         say(f"{path}: {type(error).__name__}: {said}")

@@ -193,7 +193,7 @@ def check_light(loaded: LoadedConfig) -> Finding:
     """Shows every colour briefly, then darkens the light."""
     feedback = loaded.config.feedback
     try:
-        if feedback.light == "lamp":  # which owns the lines and lets nobody else drive them
+        if feedback.light == "lamp":  # which owns the lines: no other process may drive them
             return _check_lamp(loaded.config.lamp.socket)
         with contextlib.closing(open_light(feedback)) as light:
             for colour in LAMP_COLOURS:

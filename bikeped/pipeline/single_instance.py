@@ -50,7 +50,7 @@ def holder(loaded: LoadedConfig) -> tuple[str, int] | None:
 
 
 def _holder_of(key: str) -> int | None:
-    """The pid of who has claimed it; 0: somebody who does not answer; None: it is free."""
+    """The pid of the process that has claimed it; 0: it does not answer; None: it is free."""
     with socket.socket(socket.AF_UNIX) as asking:
         asking.setblocking(False)
         try:

@@ -58,9 +58,7 @@ class BrokerConnection:
     ) -> None:
         self._config, self._timeout_s, self._cancelled = config, timeout_s, cancelled
         self._answers: list[ReasonCode] = []
-        answers = (
-            self._answers
-        )  # no reference to `self`: paho's sockets close without the collector
+        answers = self._answers  # without `self`: paho's sockets close without the collector
         self._client = client = Client(
             CallbackAPIVersion.VERSION2, client_id, reconnect_on_failure=False
         )
@@ -86,7 +84,7 @@ class BrokerConnection:
         self._wait(sent.is_published, "PUBACK" if message.qos else "to take data")
 
     def keep(self, message: MqttMessage) -> None:
-        """Publishes a message, and again whenever somebody else publishes under its topic."""
+        """Publishes a message, and again whenever another client publishes under its topic."""
 
         def restore(client: Client, _data: Any, received: MQTTMessage) -> None:
             if received.payload != message.payload:

@@ -7,7 +7,7 @@ from campaign.registry import EVIDENCE, HARDWARE, RULE, WORLD, Row, add, limits
 for number, injected, expected, limit, closed_by in (
     (20, "identities swap, tracks coast on as ghosts", "coasting is limited",
      "alerts from a track unseen over 1 s = 0", RULE),
-    (21, "a rider on a bicycle; a parked bicycle and a walker", "nobody alerts on himself",
+    (21, "a rider on a bicycle; a parked bicycle and a walker", "no rider alerts on himself",
      "alerts in 1,000 passes = 0", RULE),
     (44, "a line of the audit log edited or deleted", "the hash chain breaks",
      "first bad record found >= 100 %", EVIDENCE),

@@ -110,7 +110,7 @@ def crash_loop(rig: Rig) -> None:
 
 @row(
     45,
-    "standard error blocks: nobody reads it",
+    "standard error blocks: it has no reader",
     "the light goes on; FAULT when it is due",
     "FAULT <= 1 s",
     repeat=5,

@@ -307,7 +307,7 @@ def test_one_step_answers_resets_and_keeps_what_is_latched(tmp_path: Path) -> No
         lamp.serve()
         assert not latch.exists()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as nameless:
-        for _ in range(40):  # more than are read at once; there is nobody to answer
+        for _ in range(40):  # more than are read at once; there is no address to answer
             nameless.sendto(b"rubbish", settings["socket"])
             lamp.serve()
     lamp.serve()

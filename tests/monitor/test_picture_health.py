@@ -47,7 +47,7 @@ def street(size: tuple[int, int] = SIZE) -> ImageArray:
 def frames(
     seconds: float, fps: float = FPS, light: float = DAY, noise: float = 2.5, walker: bool = True
 ) -> Frames:
-    """The street with fresh noise in every frame, and somebody who walks."""
+    """The street with fresh noise in every frame, and a person who walks."""
     rng = np.random.default_rng(3)
     base = street().astype(np.int16)
     field = np.round(rng.normal(0, noise, (2 * SIZE[0], 2 * SIZE[1], 1))).astype(np.int16)

@@ -54,7 +54,7 @@ def _until_frames(process: subprocess.Popen[bytes], port: int, more: int) -> dic
 
 @pytest.fixture
 def full_pipe() -> Iterator[int]:
-    """The writing end of a pipe of 4 KiB that is full and that nobody reads."""
+    """The writing end of a pipe of 4 KiB that is full and has no reader."""
     reading, writing = os.pipe()
     fcntl.fcntl(writing, 1031, 4096)  # F_SETPIPE_SZ, a constant of Python 3.10 on some systems only
     os.set_blocking(writing, False)

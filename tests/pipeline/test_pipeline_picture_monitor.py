@@ -100,13 +100,13 @@ def test_a_reference_that_does_not_fit_is_named_with_the_remedy(place: Path) -> 
 
 
 def replayed(place: Path, pictures: list[ImageArray], folder: Path) -> list[dict[str, object]]:
-    """The frames' event lines of a replay of `pictures` at 30 frames/s; nobody is detected."""
+    """The frames' event lines of a replay of `pictures` at 30 frames/s; no person is detected."""
     clip, events = folder / "clip.avi", folder / "events.jsonl"
     with AviWriter(clip, 30, (480, 270)) as writer:
         for rgb in pictures:
             writer.write(simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=90))
-    nobody = OracleDetector(lambda number: Detections.empty())
-    replay(load_config(place), str(clip), detector=nobody, events=events)
+    blind = OracleDetector(lambda number: Detections.empty())
+    replay(load_config(place), str(clip), detector=blind, events=events)
     return [json.loads(line) for line in events.read_text().splitlines()[1:]]
 
 

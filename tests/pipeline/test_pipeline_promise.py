@@ -38,13 +38,13 @@ def street() -> list[ImageArray]:
 
 
 def lights(pictures: list[ImageArray], folder: Path) -> list[tuple[str, set[str]]]:
-    """What the light shows with each picture, and the codes of the faults; nobody is detected."""
+    """What the light shows with each picture, and the faults' codes; no person is detected."""
     clip, events = folder / "clip.avi", folder / "events.jsonl"
     with AviWriter(clip, FPS, SIZE) as writer:
         for rgb in pictures:
             writer.write(simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=90))
-    nobody = OracleDetector(lambda number: Detections.empty())
-    replay(load_config(), str(clip), detector=nobody, events=events)
+    blind = OracleDetector(lambda number: Detections.empty())
+    replay(load_config(), str(clip), detector=blind, events=events)
     lines = [json.loads(line) for line in events.read_text().splitlines()[1:]]
     return [(line["light"], {fault["code"] for fault in line["faults"]}) for line in lines]
 
