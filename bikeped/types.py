@@ -98,16 +98,17 @@ class Detections:
     """Detections in one frame, most confident first.
 
     `kind` [n] int8 codes of `Kind`; `confidence` [n] in 0..1; `box_px` [n, 4] as u1, v1, u2, v2
-    in pixels of the full frame.
+    in pixels of the full frame; `ridden` [n], cycles with a rider's box (None: not known).
     """
 
     kind: KindArray
     confidence: Float32Array
     box_px: Float32Array
+    ridden: BoolArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.kind)
-        _check_shapes(self, kind=(n,), confidence=(n,), box_px=(n, 4))
+        _check_shapes(self, kind=(n,), confidence=(n,), box_px=(n, 4), ridden=(n,))
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -120,7 +121,8 @@ class Detections:
 
     def take(self, index: npt.NDArray[Any]) -> Detections:
         """The detections at `index` (integers or a mask), in that order."""
-        return Detections(self.kind[index], self.confidence[index], self.box_px[index])
+        ridden = None if self.ridden is None else self.ridden[index]
+        return Detections(self.kind[index], self.confidence[index], self.box_px[index], ridden)
 
     def bottom_centre_px(self) -> FloatArray:
         """[n, 2] u, v of the middle of each lower edge, which is projected onto the ground."""
@@ -130,15 +132,17 @@ class Detections:
 
 @dataclass(frozen=True)
 class GroundPoints:
-    """Detections on the ground: `kind` [n], `xy_m` [n, 2], `detection` [n] their index."""
+    """Detections on the ground: `kind` [n], `xy_m` [n, 2], `detection` [n] their index, `ridden`
+    [n] as in `Detections`."""
 
     kind: KindArray
     xy_m: FloatArray
     detection: IntArray
+    ridden: BoolArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.kind)
-        _check_shapes(self, xy_m=(n, 2), detection=(n,))
+        _check_shapes(self, xy_m=(n, 2), detection=(n,), ridden=(n,))
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -197,12 +201,22 @@ class PairMetrics:
 
 @dataclass(frozen=True)
 class Decision:
-    """The state at `time_s`, with the reason in one line for a resident."""
+    """The state at `time_s`, with the reason in one line for a resident.
+
+    `raw` is the rule's own state of this frame, `state` what is shown of it: ALERT only when the
+    rule is sure of it, and then for a while (definitions, section 14).
+    """
 
     time_s: float
     state: State
     sentence: str
     pair: PairMetrics | None = None  #: the first that fires (ALERT) or the nearest (WARNING)
+    raw: State | None = None  #: None: as shown
+
+    @property
+    def held(self) -> bool:
+        """Whether ALERT is shown for an earlier frame's sake."""
+        return self.state is State.ALERT and self.raw not in (None, State.ALERT)
 
 
 class Sound(str, enum.Enum):
@@ -226,6 +240,8 @@ class Signal:
 
 def _check_shapes(owner: object, **shapes: tuple[int, ...]) -> None:
     for name, shape in shapes.items():
-        actual = getattr(owner, name).shape
-        if actual != shape:
-            raise ValueError(f"{type(owner).__name__}.{name}: expected shape {shape}, got {actual}")
+        array = getattr(owner, name)
+        if array is not None and array.shape != shape:
+            raise ValueError(
+                f"{type(owner).__name__}.{name}: expected shape {shape}, got {array.shape}"
+            )

@@ -11,6 +11,7 @@ from bikeped.config.lens_check import Calibration
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig, TrackingConfig
 from bikeped.decision.rules import RuleSettings
+from bikeped.decision.shown import ShownSettings
 from bikeped.errors import ConfigError, GeometryError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.geometry.framing import Framing
@@ -40,6 +41,12 @@ def rule_settings(decision: DecisionConfig, speed_window_frames: int = 4) -> Rul
         deceleration_mps2=decision.deceleration_mps2,
         speed_window_s=speed_window_frames / fps,
         ttc_s=decision.ttc_s,
+        max_unseen_s=decision.max_unseen_s,
+        shown=ShownSettings(
+            on_frames=decision.alert_on_frames,
+            window_s=(decision.alert_window_frames - 0.5) / fps,
+            hold_s=decision.alert_hold_s,
+        ),
     )
 
 

@@ -85,8 +85,6 @@ class FeedbackConfig(Section, frozen=True):
     """blinking of ALERT's red, flashes per second"""
     fault_blink_hz: Annotated[float, Meta(ge=0.25, le=5)] = 0.5
     """blinking of FAULT's orange, flashes per second"""
-    hold_alert_s: Annotated[float, Meta(ge=0, le=10)] = 1.0
-    """the light keeps ALERT at least this long, so that an alert of one frame is visible, s"""
     recover_frames: Annotated[int, Meta(ge=1, le=150)] = 5
     """good frames in a row before the light leaves FAULT"""
     gpio: GpioConfig = msgspec.field(default_factory=GpioConfig)

@@ -220,6 +220,14 @@ class DecisionConfig(Section, frozen=True):
     """cyclist's deceleration in the stopping distance, m/s^2"""
     ttc_s: Annotated[float, Meta(gt=0, le=60)] = 3.0
     """time to collision below which rule ttc fires, s"""
+    max_unseen_s: Annotated[float, Meta(ge=0, le=2)] = 1.0
+    """a track counts, as present, in memory and in a pair, only while seen within this time, s"""
+    alert_on_frames: Annotated[int, Meta(ge=1, le=30)] = 2
+    """ALERT is shown when the rule says so in this many of the last `alert_window_frames`"""
+    alert_window_frames: Annotated[int, Meta(ge=1, le=30)] = 3
+    """nominal frames in which `alert_on_frames` are counted"""
+    alert_hold_s: Annotated[float, Meta(ge=0, le=2)] = 1.5
+    """ALERT is shown for this long after the rule last said so, s"""
     nominal_fps: Annotated[float, Meta(ge=1, le=240)] = 30.0
     """turns settings in frames into seconds, once"""
 

@@ -14,6 +14,9 @@ from bikeped.config.schema import Config, sections
 from bikeped.config.strict_yaml import one_line
 from bikeped.errors import ConfigError
 
+#: Keys of older versions, and what stands for them now.
+_RENAMED = {"feedback.hold_alert_s": "decision.alert_hold_s"}
+
 
 def to_config(data: dict[str, Any], source: str) -> Config:
     """The configuration that `data` holds; ConfigError names `source`, the key and the remedy."""
@@ -34,10 +37,13 @@ def to_config(data: dict[str, Any], source: str) -> Config:
 
 def check_together(config: Config, source: str) -> None:
     """Checks keys that depend on one another; ConfigError as `to_config`."""
-    camera, mqtt, web = config.camera, config.mqtt, config.web
+    camera, decision, mqtt, web = config.camera, config.decision, config.mqtt, config.web
     if camera.calibration is None and None in (camera.radius_px, camera.fov_deg):
         problem = "camera.calibration: missing; name a calibration file, or set both "
         problem += "camera.radius_px and camera.fov_deg"
+    elif decision.alert_on_frames > decision.alert_window_frames:
+        problem = f"decision.alert_on_frames: {decision.alert_on_frames} of "
+        problem += f"{decision.alert_window_frames} frames (decision.alert_window_frames); lower it"
     elif camera.password_file is not None and camera.username is None:
         problem = "camera.password_file: without camera.username; set it too"
     elif (mqtt.cert_file is None) != (mqtt.key_file is None):
@@ -86,7 +92,10 @@ def _explain(error: msgspec.ValidationError, data: dict[str, Any]) -> str:
 
 
 def _explain_unknown(section: str, name: str) -> str:
-    """The nearest known key of the section, a key of that name elsewhere, or all of the section."""
+    """The key's new name, the nearest known key of the section, a key of that name elsewhere, or
+    all of the section."""
+    if renamed := _RENAMED.get(f"{section}.{name}"):
+        return f"{section}.{name}: is now {renamed}; write it there"
     struct = dict(sections(Config)).get(section)
     names = [] if struct is None else [field.name for field in msgspec.structs.fields(struct)]
     elsewhere = [key for key in known_keys() if key.split(".")[-1] == name]

@@ -14,7 +14,9 @@ from bikeped.decision.rules import (
     is_remembered,
     resolve_state,
 )
-from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
+from bikeped.decision.shown import ShownAlert, shown_states
+from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows
+from bikeped.decision.who_counts import RIDER_S, counted_pairs
 from bikeped.types import BoolArray, Decision, FloatArray, IntArray, KindArray, PairMetrics, State
 
 
@@ -26,24 +28,53 @@ class Decider:
 
     def __init__(self, settings: RuleSettings) -> None:
         self.settings = settings
-        self._buffer = RowBuffer(max(settings.lookback_s, settings.speed_window_s))
+        span_s = max(settings.lookback_s, settings.speed_window_s, RIDER_S)
+        self._buffer = RowBuffer(span_s)
         self._last_cyclist_s = -math.inf
+        self._shown = ShownAlert(settings.shown)
+        self._alert_pair: PairMetrics | None = None
 
-    def decide(self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray) -> Decision:
-        """The decision at `time_s` (s); `ids` [n] ascending, `kind` [n], `xy_m` [n, 2] (m)."""
-        rows, newest = self._buffer.append(time_s, ids, kind, xy_m)
-        pairs = pair_rows(rows, newest)
+    def decide(
+        self,
+        time_s: float,
+        ids: IntArray,
+        kind: KindArray,
+        xy_m: FloatArray,
+        velocity_mps: FloatArray | None = None,
+        counted: BoolArray | None = None,
+    ) -> Decision:
+        """The decision at `time_s` (s); `ids` [n] ascending, `kind` [n], `xy_m` [n, 2] (m).
+
+        `velocity_mps` [n, 2]: of the tracks (None: standing); `counted` [n]: those that
+        `who_counts.counts` admits (None: all).
+        """
+        if velocity_mps is None:
+            velocity_mps = np.zeros((len(ids), 2))
+        if counted is None:
+            counted = np.ones(len(ids), np.bool_)
+        rows, newest = self._buffer.append(time_s, ids, kind, xy_m, velocity_mps, counted)
+        pairs = counted_pairs(rows, newest, self.settings.count_all)
         checks = evaluate_rule(rows, pairs, self.settings)
-        if np.count_nonzero(kind == CYCLIST):
+        if np.count_nonzero((kind == CYCLIST) & counted):
             self._last_cyclist_s = time_s
-        pedestrians = np.count_nonzero(kind == PEDESTRIAN)
+        pedestrians = np.count_nonzero((kind == PEDESTRIAN) & counted)
         remembered = is_remembered(time_s, self._last_cyclist_s, self.settings.memory_s)
         approaching = np.count_nonzero(checks.fires) > 0
-        state = State(resolve_state(pedestrians > 0, remembered, approaching).item())
-        index = select_pair(state, checks.fires, checks.distance_m)
+        raw = State(resolve_state(pedestrians > 0, remembered, approaching).item())
+        index = select_pair(raw, checks.fires, checks.distance_m)
         pair = None if index is None else pair_metrics(index, rows, pairs, checks, self.settings)
-        sentence = explain(state, pair, pedestrians, time_s - self._last_cyclist_s, self.settings)
-        return Decision(time_s, state, sentence, pair)
+        since_s = time_s - self._last_cyclist_s
+        shown = self._shown.update(time_s, raw is State.ALERT)
+        if raw is State.ALERT:
+            self._alert_pair = pair
+        state = State(shown_states(np.asarray(raw), np.asarray(shown)).item())
+        sentence = explain(raw, pair, pedestrians, since_s, self.settings)
+        if state is State.ALERT and raw is not State.ALERT:
+            pair = self._alert_pair
+            sentence = f"ALERT: held for {self.settings.shown.hold_s:g} s. Now {sentence}"
+        elif state is not raw:
+            sentence = sentence.replace(raw.name, f"{state.name}, not yet sure", 1)
+        return Decision(time_s, state, sentence, pair, raw)
 
 
 def select_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int | None:

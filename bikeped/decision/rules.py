@@ -9,12 +9,13 @@ remembered, approaching.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from bikeped.decision.shown import ShownSettings
 from bikeped.decision.track_rows import EPSILON_S, IndexArray, Pairs, TrackRows
 from bikeped.types import BoolArray, FloatArray, State
 
@@ -48,6 +49,9 @@ class RuleSettings:
     deceleration_mps2: float = 1.96
     speed_window_s: float = 4 / 30
     ttc_s: float = 3.0
+    max_unseen_s: float = 1.0
+    count_all: bool = False  #: riders and parked cycles too, as in the paper's simulation
+    shown: ShownSettings = field(default_factory=ShownSettings)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.types import FloatArray, IntArray, Kind, KindArray
+from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
 
 IndexArray = npt.NDArray[np.intp]
 
@@ -27,8 +27,9 @@ CYCLIST, PEDESTRIAN = int(Kind.CYCLIST), int(Kind.PEDESTRIAN)
 class TrackRows:
     """Parallel arrays over rows, sorted by frame, within a frame in track order.
 
-    `frame` [r] counts frames; `time_s` [r] is the frame's time; `xy_m` [r, 2] is in the camera
-    ground frame; `previous` [r] is a row index or -1.
+    `frame` [r] counts frames; `time_s` [r] is the frame's time; `xy_m` and `velocity_mps` [r, 2]
+    are in the camera ground frame; `counts` [r] are tracks that the decision may count
+    (`who_counts`); `previous` [r] is a row index or -1.
     """
 
     frame: IndexArray
@@ -36,6 +37,8 @@ class TrackRows:
     id: IntArray
     kind: KindArray
     xy_m: FloatArray
+    velocity_mps: FloatArray
+    counts: BoolArray
     previous: IndexArray
 
     def __len__(self) -> int:
@@ -57,10 +60,14 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.cyclist)
 
+    def take(self, index: BoolArray) -> Pairs:
+        """The pairs at `index` [m]."""
+        return Pairs(self.cyclist_row, self.cyclist[index], self.pedestrian_row[index])
+
 
 def pair_rows(rows: TrackRows, first_row: int = 0) -> Pairs:
-    """All cyclist-pedestrian pairs within each frame, of the rows from `first_row` on."""
-    kind = rows.kind[first_row:]
+    """All pairs that count within each frame, of the rows from `first_row` on."""
+    kind = np.where(rows.counts[first_row:], rows.kind[first_row:], -1)
     cyclist_row = (kind == CYCLIST).nonzero()[0] + first_row
     pedestrian_row = (kind == PEDESTRIAN).nonzero()[0] + first_row
     cyclists, pedestrians = len(cyclist_row), len(pedestrian_row)
@@ -88,15 +95,29 @@ class RowBuffer:
         self._last_count = 0  #: tracks in the last frame
         none = np.zeros(0, np.intp)
         self._rows = TrackRows(
-            none, np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 2)), none
+            none,
+            np.zeros(0),
+            np.zeros(0, np.int64),
+            np.zeros(0, np.int8),
+            np.zeros((0, 2)),
+            np.zeros((0, 2)),
+            np.zeros(0, np.bool_),
+            none,
         )
 
     def append(
-        self, time_s: float, ids: IntArray, kind: KindArray, xy_m: FloatArray
+        self,
+        time_s: float,
+        ids: IntArray,
+        kind: KindArray,
+        xy_m: FloatArray,
+        velocity_mps: FloatArray,
+        counts: BoolArray,
     ) -> tuple[TrackRows, int]:
         """Adds the frame at `time_s`; returns all rows held and the index of its first row.
 
-        `ids` [n] ascending, `kind` [n], `xy_m` [n, 2] (m). ValueError when time does not advance.
+        `ids` [n] ascending; the other arrays are those of `TrackRows`. ValueError when time does
+        not advance.
         """
         if time_s <= self._last_s:
             raise ValueError(f"time_s: {time_s} is not after the last frame's {self._last_s}")
@@ -112,7 +133,16 @@ class RowBuffer:
             place = np.minimum(before.searchsorted(ids), len(before) - 1)
             previous = np.where(before[place] == ids, place + first - len(before), -1)
         frame = old.frame[-1] + 1 if len(old) else 0
-        new = TrackRows(np.full(count, frame), np.full(count, time_s), ids, kind, xy_m, previous)
+        new = TrackRows(
+            np.full(count, frame),
+            np.full(count, time_s),
+            ids,
+            kind,
+            xy_m,
+            velocity_mps,
+            counts,
+            previous,
+        )
         kept = replace(old, previous=np.maximum(old.previous - cut, -1))
         pairs = zip(vars(kept).values(), vars(new).values(), strict=True)
         self._rows = TrackRows(*(np.concatenate([past[cut:], now]) for past, now in pairs))

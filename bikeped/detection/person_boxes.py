@@ -93,9 +93,9 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
     cycle = np.nonzero(found.kind == Kind.CYCLIST)[0]
     box, score = found.box_px.copy(), found.confidence.copy()
     dropped = (found.kind == Kind.CYCLIST) & (score < confidence)
+    ridden: BoolArray = np.zeros(len(found), np.bool_)
     if overlap < 1 and len(person) and len(cycle):
         pairs, fits = _pairs(found.box_px[person], found.box_px[cycle], overlap)
-        ridden = np.zeros(len(found), np.bool_)
         ridden[cycle[[j for _, j in pairs]]] = True
         riding = np.zeros(len(found), np.bool_)
         riding[person[[i for i, _ in pairs]]] = True
@@ -120,7 +120,7 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
             dropped[cycle[part & ~ridden[cycle] & (found.confidence[cycle] <= score[own])]] = True
     left = np.nonzero(~dropped)[0]
     order = left[np.argsort(-score[left], kind="stable")]
-    return Detections(found.kind[order], score[order], box[order])
+    return Detections(found.kind[order], score[order], box[order], ridden[order])
 
 
 def _pairs(

@@ -1,4 +1,4 @@
-"""Which signal the light and the speaker show: FAULT, recovery and the hold of ALERT. Pure.
+"""Which signal the light and the speaker show: FAULT, recovery and ALERT beside a fault. Pure.
 
 The table of states is the paper's table 2; FAULT is bikeped's addition.
 
@@ -20,8 +20,8 @@ The machine counts good frames: new decisions without a fault, in a row. It star
 
 * A new ALERT shows red at once: at the start, during recovery and beside a fault too. Early red
   reassures no one. A decision that cannot be trusted is passed as None.
-* ALERT is held for `hold_alert_s`, so that a single frame of it is visible. The hold outlives a
-  fault that begins meanwhile, but a fault does not renew it: red ends with the hold, then FAULT.
+* A held ALERT (`Decision.held`) stays red until a fault, which ends the hold: beside it red lasts
+  `FRESH_S` after the last frame in which the rule itself said ALERT.
 * Blue, green and steady orange need the full count: a light never shows them before frames came.
 * FAULT that comes and goes is waited out: from the third within `FLICKER_S` on that ends another
   light, the light leaves it only after `UNSTEADY_S` without a fault, doubled with each more.
@@ -43,6 +43,9 @@ STARTING = Fault("starting", "service.starting", "not enough good frames yet")
 
 #: Within this time so many falls into FAULT are flicker, and the first wait for a steady light.
 FLICKER_S, FLICKERS, UNSTEADY_S, LONGEST_WAIT_S = 30.0, 3, 5.0, 30.0
+
+#: Beside a fault an ALERT is fresh for so long: longer than from one frame to the next.
+FRESH_S = 0.2
 
 OFF = Signal("OFF", Colour.OFF)
 
@@ -68,7 +71,6 @@ class SignalLogic:
 
     blink_hz: float = 2.0  #: of ALERT, flashes a second
     fault_blink_hz: float = 0.5  #: of FAULT
-    hold_alert_s: float = 1.0
     recover_frames: int = 5
 
     def __post_init__(self) -> None:
@@ -78,7 +80,7 @@ class SignalLogic:
         self._good_frames = 0
         self._recovering_from: tuple[Fault, ...] = (STARTING,)
         self._decided: State | None = None  # by the newest good frame
-        self._alert_s: float | None = None  # time of the newest ALERT
+        self._alert_s = -math.inf  # time of the newest ALERT that is not held
         self._falls_s: list[float] = []  # when FAULT followed a light that was trusted
         self._steady_from_s = -math.inf  # until then the light stays in FAULT
         self._unsteady: tuple[Fault, ...] = ()
@@ -90,37 +92,48 @@ class SignalLogic:
         return cls(
             blink_hz=feedback.blink_hz,
             fault_blink_hz=feedback.fault_blink_hz,
-            hold_alert_s=feedback.hold_alert_s,
             recover_frames=feedback.recover_frames,
         )
 
     def next_signal(
-        self, now_s: float, decided: State | None, faults: tuple[Fault, ...] = ()
+        self,
+        now_s: float,
+        decided: State | None,
+        faults: tuple[Fault, ...] = (),
+        held: bool = False,
     ) -> Signal:
         """The signal at `now_s`, in seconds of one monotonic clock.
 
         `decided` is the state of a new frame, None on a tick of the clock or when the decision
-        cannot be trusted. `faults` are those present now whose effect on the light is FAULT or
-        WITHHELD. The chime is in the one signal in which SAFE begins.
+        cannot be trusted; `held`: it is an ALERT that is held. `faults` are those present now
+        whose effect on the light is FAULT or WITHHELD. The chime is in the one signal in which SAFE
+        begins.
         """
         stopping = tuple(fault for fault in faults if fault.kind.effect is Effect.FAULT)
-        if decided is State.ALERT:
+        if decided is State.ALERT and not held:
             self._alert_s = now_s
         if stopping:
             self._count_falls(now_s)
-            self._good_frames = 0
+            self._good_frames, self._decided = 0, None
             self._recovering_from = tuple(
                 Fault("recovering", "service.recovering", str(fault)) for fault in stopping
             )
         elif decided is not None:
-            self._decided = decided
+            # A hold that a fault has ended does not come back.
+            ended = held and self._shown != "ALERT"
+            self._decided = State.WARNING if ended else decided
+            if decided is not State.ALERT:
+                self._alert_s = -math.inf
             self._good_frames = min(self._good_frames + 1, self.recover_frames)
         if now_s < self._steady_from_s and not stopping:
             faults = (*self._unsteady, *faults)
         trusted = self._decided if self._good_frames >= self.recover_frames else None
         trusted = None if now_s < self._steady_from_s else trusted
 
-        if self._alert_held(now_s) or trusted is State.ALERT:
+        # A clock that stepped back (a recording that loops) does not prolong an ALERT.
+        fresh = 0 <= now_s - self._alert_s <= FRESH_S
+        holding = self._shown == "ALERT" and self._decided is State.ALERT and not stopping
+        if fresh or holding or trusted is State.ALERT:
             # The faults travel with the red light, so that telemetry sees them.
             signal = Signal("ALERT", Colour.RED, self.blink_hz, Sound.BELL, faults)
         elif trusted is None:
@@ -147,14 +160,3 @@ class SignalLogic:
             text = f"FAULT came {len(self._falls_s)} times in {FLICKER_S:g} s: waiting for "
             text += f"{wait_s:g} s without a fault"
             self._unsteady = (Fault("service", "service.unsteady", text),)
-
-    def _alert_held(self, now_s: float) -> bool:
-        """Whether the newest ALERT still keeps the light red.
-
-        A clock that stepped back (a recording that loops) ends the hold and never prolongs it.
-        """
-        if self._alert_s is None:
-            return False
-        age_s = now_s - self._alert_s
-        # The call that brought the ALERT shows it even with hold_alert_s = 0.
-        return age_s == 0 or 0 <= age_s < self.hold_alert_s

@@ -72,7 +72,8 @@ def draw_banner(image: ImageArray, data: OverlayData, rect: Rect) -> None:
         ink = readable_on(colour)
         draw_text(image, name, (x0 + pad, y0 + (tall - big) / 2), big, ink, bold=True)
         left = x0 + wide + pad
-        rule = data.decision.state.name
+        decision = data.decision
+        rule = (decision.state if decision.raw is None else decision.raw).name
         if rule != name and name != "OFF":
             # The light holds ALERT for a while: show the rule's present state too.
             note = f"rule now: {rule}"

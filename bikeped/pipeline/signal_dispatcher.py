@@ -50,8 +50,8 @@ class SignalDispatcher:
         """Shows what `decision` (None: no new one) and `faults` lead to at `now_s`."""
         if decision is not None:
             self._decision = decision
-        decided = None if decision is None else decision.state
-        signal = self._logic.next_signal(now_s, decided, faults)
+        decided, held = (None, False) if decision is None else (decision.state, decision.held)
+        signal = self._logic.next_signal(now_s, decided, faults, held)
         if signal.name == "FAULT" or self._decision is None:
             self._send(signal, "; ".join(fault_texts(signal.faults)))
         else:

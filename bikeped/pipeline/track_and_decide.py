@@ -16,6 +16,7 @@ import numpy as np
 from bikeped.config.build import framing, ground_camera, rule_settings, tracker_settings
 from bikeped.config.load import LoadedConfig
 from bikeped.decision.decider import Decider
+from bikeped.decision.who_counts import counts
 from bikeped.faults import Fault
 from bikeped.geometry.camera import GroundTable
 from bikeped.geometry.framing import Framing
@@ -55,7 +56,8 @@ class GroundMapper:
         xy, valid = self.table.lookup(crop)
         near = valid & (np.nan_to_num(np.hypot(xy[:, 0], xy[:, 1]), nan=np.inf) < self._max_range_m)
         index = np.nonzero(near)[0]
-        points = GroundPoints(detections.kind[index], xy[index], index.astype(np.int64))
+        ridden = None if detections.ridden is None else detections.ridden[index]
+        points = GroundPoints(detections.kind[index], xy[index], index.astype(np.int64), ridden)
         return points, int((~valid).sum())
 
 
@@ -145,8 +147,10 @@ class TrackAndDecide:
         self._last_s = captured_s
         tracks = self.tracker.update(points, captured_s)
         tracked = time.perf_counter()
+        velocity, _ = self.tracker.smoothed()
+        counted = counts(tracks.unseen_s, self.tracker.parked(), self._rule.max_unseen_s)
         decision = self._decider.decide(
-            captured_s, tracks.id, tracks.kind, self._ahead(tracks, age_s)
+            captured_s, tracks.id, tracks.kind, self._ahead(tracks, age_s), velocity, counted
         )
         decided = time.perf_counter()
         track_ms, decide_ms = (tracked - began) * 1e3, (decided - tracked) * 1e3
@@ -172,4 +176,5 @@ def _most_confident(points: GroundPoints, confidence: Float32Array) -> GroundPoi
     order = np.lexsort((distance_m, -confidence[points.detection]))
     kind = points.kind[order]
     kept = np.sort(np.concatenate([order[kind == k][:MAX_OF_A_KIND] for k in Kind]))
-    return GroundPoints(points.kind[kept], points.xy_m[kept], points.detection[kept])
+    ridden = None if points.ridden is None else points.ridden[kept]
+    return GroundPoints(points.kind[kept], points.xy_m[kept], points.detection[kept], ridden)

@@ -24,7 +24,7 @@ from bikeped.monitor.detector_check import DetectorNumbers
 from bikeped.monitor.verdicts import Verdict
 from bikeped.telemetry import schema as messages
 from bikeped.telemetry.schema import EventHeader, EventLine, EventTrack, KindLabel, ShownState
-from bikeped.types import Decision, Detections, FloatArray, Kind, KindArray, Tracks
+from bikeped.types import Decision, Detections, FloatArray, Kind, KindArray, State, Tracks
 
 VOLATILE_KEYS = ("latency_ms", "started_at")  #: the only keys that differ between two replays
 
@@ -146,8 +146,8 @@ def event_line(
     return EventLine(
         t=json_number(t_s, 4) or 0.0,
         frame=frame,
-        state=_state(decision),
-        light=light or _state(decision),
+        state=_state(decision.state),
+        light=light or _state(decision.state),
         faults=[
             messages.EventFault(source=fault.source, code=fault.code, detail=fault.detail)
             for fault in faults
@@ -164,6 +164,7 @@ def event_line(
             )
         ],
         sentence=decision.sentence,
+        raw_state=_state(decision.state if decision.raw is None else decision.raw),
         latency_ms={stage: json_number(ms, 3) or 0.0 for stage, ms in latency_ms.items()},
     )
 
@@ -211,8 +212,8 @@ def decision_digest(lines: Iterable[bytes | str]) -> str:
     return digest.hexdigest()
 
 
-def _state(decision: Decision) -> ShownState:
-    return cast(ShownState, decision.state.name)
+def _state(state: State) -> ShownState:
+    return cast(ShownState, state.name)
 
 
 def _labels(kinds: KindArray) -> list[KindLabel]:

@@ -230,7 +230,8 @@ class EventLine(msgspec.Struct, frozen=True, kw_only=True):
 
     t: Annotated[float, Meta(description="seconds from the start")]
     frame: Count
-    state: Annotated[ShownState, Meta(description="what was decided")]
+    state: Annotated[ShownState, Meta(description="what was decided, a held ALERT included")]
+    raw_state: Annotated[ShownState, Meta(description="what the rule said of this frame alone")]
     light: Annotated[ShownState, Meta(description="what the light showed: FAULT may cover state")]
     faults: Annotated[list[EventFault], Meta(description="those that the light showed or held")]
     pair: Pair | None

@@ -65,6 +65,9 @@ _CYCLE_SHARES = (0.12, 0.03)
 _MAJORITY_SHARES = (0.55, 0.45)
 #: A cyclist's track unseen for longer is not continued by a detection of a person.
 _RIDER_MAX_UNSEEN_S = 1.0
+#: A cycle that stands (definitions, section 13): it moves no farther than this, for so long, and no
+#: person has been this near within the last seconds, for a waiting rider is missed now and then.
+_STANDS_M, _PARKED_AFTER_S, _PERSON_M, _PERSON_MEMORY_S = 0.5, 10.0, 1.0, 2.0
 #: A track that is not yet confirmed is dropped when unseen for longer than this.
 _TENTATIVE_MAX_UNSEEN_S = 0.2
 
@@ -112,7 +115,8 @@ class BatchTracker:
 
     Arrays are [batch, slots]; positions (m), velocities and accelerations [batch, slots, 2]. Values
     in slots with `alive` false are undefined. `id` counts up from 1 in each scene in order of
-    birth; `detection` is the index matched in the last update, or -1.
+    birth; `detection` is the index matched in the last update, or -1; `parked` marks cycles that
+    stand without a person, until they move.
     """
 
     def __init__(self, settings: TrackerSettings, scenes: int = 1, slots: int = 8) -> None:
@@ -127,7 +131,11 @@ class BatchTracker:
         self.seen_s: FloatArray = np.zeros((scenes, slots))
         self.hits: IntArray = np.zeros((scenes, slots), np.int64)
         self.detection: IndexArray = np.full((scenes, slots), -1, np.intp)
+        self.parked: BoolArray = np.zeros((scenes, slots), np.bool_)
         self._seen_xy_m: FloatArray = np.zeros((scenes, slots, 2))
+        self._stands_xy_m: FloatArray = np.zeros((scenes, slots, 2))
+        self._stands_s: FloatArray = np.zeros((scenes, slots))
+        self._person_s: FloatArray = np.zeros((scenes, slots))
         self._cycle_share: FloatArray = np.zeros((scenes, slots))
         self._next_id: IntArray = np.ones(scenes, np.int64)
         self._max_speed = np.asarray(settings.max_speed_mps)
@@ -138,11 +146,14 @@ class BatchTracker:
         """[batch, slots]: the tracks that count as present."""
         return self.alive & (self.hits >= self.settings.confirm_hits)
 
-    def update(self, time_s: float, xy_m: FloatArray, kind: KindArray) -> None:
+    def update(
+        self, time_s: float, xy_m: FloatArray, kind: KindArray, ridden: BoolArray | None = None
+    ) -> None:
         """Advances every scene to `time_s` with detections `xy_m` [batch, n, 2] in metres.
 
         `kind` [batch, n]; -1 marks an unused place, for scenes differ in their number of
-        detections. ValueError when time goes back.
+        detections. `ridden` [batch, n]: cycles whose rider was seen with them. ValueError when
+        time goes back.
         """
         if time_s < self.time_s:
             raise ValueError(f"time_s: {time_s} is before the last update at {self.time_s}")
@@ -157,6 +168,7 @@ class BatchTracker:
         matched, refused = self._match(xy_m, kind)
         self.detection = matched
         self._correct(time_s, xy_m, kind, matched)
+        self._find_parked(time_s, xy_m, kind, ridden)
         self._drop(time_s)
         fresh = kind >= 0
         scene, slot = (matched >= 0).nonzero()
@@ -281,10 +293,37 @@ class BatchTracker:
             acceleration[flat] = acceleration[flat] * kept + raw_a * (1 - kept)
         self.xy_m.reshape(-1, 2)[flat] = new_xy
         seen_xy[flat] = new_xy
+        stands = self._stands_xy_m.reshape(-1, 2)
+        moved = flat[((new_xy - stands[flat]) ** 2).sum(1) > _STANDS_M**2]
+        if len(moved):
+            stands[moved] = self.xy_m.reshape(-1, 2)[moved]
+            self._stands_s.reshape(-1)[moved] = time_s
+            self.parked.reshape(-1)[moved] = False
         seen_s[flat] = time_s
         hits[flat] += 1
         if self.settings.rider_radius_m > 0:
             self._update_kind(flat, kind.ravel()[place])
+
+    def _find_parked(
+        self, time_s: float, xy_m: FloatArray, kind: KindArray, ridden: BoolArray | None
+    ) -> None:
+        """Marks cycles that have stood for long and have no person beside them."""
+        if self.settings.cyclist_box_includes_rider:
+            return  # every cycle is ridden
+        stood_s = time_s - self._stands_s
+        still = self.alive & (self.kind == _CYCLIST) & ~self.parked
+        still &= stood_s >= _PARKED_AFTER_S - _PERSON_MEMORY_S
+        scene, slot = still.nonzero()
+        if len(scene) == 0:
+            return
+        distance_m2 = ((self.xy_m[scene, slot, None] - xy_m[scene]) ** 2).sum(-1)
+        person = ((kind[scene] == _PEDESTRIAN) & (distance_m2 <= _PERSON_M**2)).any(axis=1)
+        if ridden is not None:  # index -1 reads the last place: unmatched
+            unmatched = np.zeros((len(ridden), 1), np.bool_)
+            person |= np.hstack([ridden, unmatched])[scene, self.detection[scene, slot]]
+        self._person_s[scene[person], slot[person]] = time_s
+        alone = time_s - self._person_s[scene, slot] > _PERSON_MEMORY_S
+        self.parked[scene, slot] = alone & (stood_s[scene, slot] >= _PARKED_AFTER_S - _EPSILON_S)
 
     def _update_kind(self, flat: IndexArray, seen: KindArray) -> None:
         """Lets the kind of pedestrians and cyclists follow their recent detections."""
@@ -338,7 +377,10 @@ class BatchTracker:
         self._next_id += need
         self.kind[at] = kind[scene, detection]
         self.xy_m[at] = xy_m[scene, detection]
-        self._seen_xy_m[at] = xy_m[scene, detection]
+        self._seen_xy_m[at] = self._stands_xy_m[at] = xy_m[scene, detection]
+        self._stands_s[at] = time_s
+        self._person_s[at] = -math.inf
+        self.parked[at] = False
         self.velocity_mps[at] = 0.0
         self.acceleration_mps2[at] = 0.0
         self.seen_s[at] = time_s

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
-from bikeped.types import FloatArray, GroundPoints, Tracks
+from bikeped.types import BoolArray, FloatArray, GroundPoints, Tracks
 
 _EPSILON_S = 1e-6
 
@@ -33,7 +33,8 @@ class Tracker:
     def update(self, points: GroundPoints, time_s: float) -> Tracks:
         """Tracks at `time_s` (seconds), updated with that frame's ground points."""
         batch = self.batch
-        batch.update(time_s, points.xy_m[None], points.kind[None])
+        ridden = None if points.ridden is None else points.ridden[None]
+        batch.update(time_s, points.xy_m[None], points.kind[None], ridden)
         slot = batch.reported[0].nonzero()[0]
         slot = slot[batch.id[0][slot].argsort(kind="stable")]
         ids = batch.id[0][slot]
@@ -57,6 +58,10 @@ class Tracker:
         """Smoothed velocity (m/s) and acceleration (m/s^2) [n, 2] of the last update's tracks."""
         slot = self._slot
         return self.batch.velocity_mps[0][slot], self.batch.acceleration_mps2[0][slot]
+
+    def parked(self) -> BoolArray:
+        """Which of the last update's tracks [n] are cycles that stand without a person."""
+        return np.asarray(self.batch.parked[0][self._slot])
 
     def history(self) -> Mapping[int, list[list[float]]]:
         """Positions [x, y] (m) of every present track by id, oldest first."""

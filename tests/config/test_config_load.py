@@ -292,6 +292,10 @@ def accepted(key, value):
     data = yaml.safe_load(with_key(key, value))
     if key == "decision.d_max_m":
         data["decision"]["d_min_m"] = 0
+    if key == "decision.alert_on_frames":
+        data["decision"]["alert_window_frames"] = 30
+    if key == "decision.alert_window_frames":
+        data["decision"]["alert_on_frames"] = 1
     if key == "decision.d_min_m":
         data["decision"]["d_max_m"] = 100
     return yaml.safe_dump(data)

@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 
 from bikeped.decision.decider import Decider
 from bikeped.decision.rules import RuleSettings, evaluate_rule, is_remembered, resolve_state
-from bikeped.decision.track_rows import TrackRows, pair_rows
+from bikeped.decision.shown import AS_RAW
+from bikeped.decision.track_rows import TrackRows
+from bikeped.decision.who_counts import counted_pairs
 from bikeped.types import State
 
 PEDESTRIAN, CYCLIST = 0, 1
-SELECTED = RuleSettings()
+SELECTED = RuleSettings(shown=AS_RAW)
 
 
 def step(decider, t, tracks):
@@ -106,7 +108,7 @@ def test_only_a_moment_of_the_past_is_held():
     decider = Decider(SELECTED)
     for i in range(5000):
         step(decider, i / 30, {1: (PEDESTRIAN, 0.0, 0.0)})
-    assert len(decider._buffer._rows) <= 8
+    assert len(decider._buffer._rows) <= 17
 
 
 def test_a_night_without_anybody_is_not_remembered():
@@ -159,7 +161,9 @@ def test_other_states_say_why():
         ([9.1, 9.1, 9.0], {"rule": "ttc"}, "were 9.10 m 0.07 s ago: not soon together"),
     ]
     for ys, changes, part in cases:
-        decision = sentence_of(replace(SELECTED, speed_adaptive=False, **changes), ride(ys))
+        decision = sentence_of(
+            replace(SELECTED, speed_adaptive=False, count_all=True, **changes), ride(ys)
+        )
         assert decision.state is State.WARNING
         assert part in decision.sentence
     gone = sentence_of(
@@ -196,6 +200,8 @@ rules = st.builds(
     lookback_s=st.sampled_from([1 / 30, 2 / 30, 7 / 30]),
     max_range_m=st.sampled_from([8.0, 25.0]),
     speed_adaptive=st.booleans(),
+    shown=st.just(AS_RAW),
+    count_all=st.just(True),
 )
 
 
@@ -299,13 +305,15 @@ def rows_of(frames):
         np.array(number, np.int64),
         np.array(kind, np.int8),
         np.array(xy, np.float64).reshape(-1, 2),
+        np.zeros((len(xy), 2)),
+        np.ones(len(xy), np.bool_),
         np.array(previous, np.intp),
     )
 
 
 def states_at_once(rule, frames):
     rows, count = rows_of(frames), len(frames)
-    pairs = pair_rows(rows)
+    pairs = counted_pairs(rows, count_all=True)
     fires = evaluate_rule(rows, pairs, rule).fires
     times = np.array([t for t, _ in frames])
     cyclist = np.bincount(rows.frame[rows.kind == CYCLIST], minlength=count) > 0
@@ -329,7 +337,7 @@ def test_frame_by_frame_equals_all_at_once_equals_the_plain_writing(rule, frames
 @given(rules, sequences())
 def test_the_numbers_are_the_same_too(rule, frames):
     rows = rows_of(frames)
-    pairs = pair_rows(rows)
+    pairs = counted_pairs(rows, count_all=True)
     verdicts = evaluate_rule(rows, pairs, rule)
     frame = rows.frame[pairs.pedestrian_row]
     for f, decision in enumerate(run(rule, frames)):

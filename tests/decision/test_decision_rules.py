@@ -7,14 +7,15 @@ import pytest
 
 from bikeped.decision.decider import Decider
 from bikeped.decision.rules import RuleSettings, evaluate_rule
+from bikeped.decision.shown import AS_RAW
 from bikeped.decision.track_rows import TrackRows, pair_rows
 from bikeped.types import State
 
 PEDESTRIAN, CYCLIST, VEHICLE = 0, 1, 2
-SELECTED = RuleSettings()
+SELECTED = RuleSettings(shown=AS_RAW)
 RULES = ("pairwise", "naive", "ttc", "distance")
 #: Plain bounds for cases that are about something else.
-PLAIN = RuleSettings(d_min_m=1.0, d_max_m=20.0, min_displacement_m=0.1, speed_adaptive=False)
+PLAIN = replace(SELECTED, d_min_m=1.0, d_max_m=20.0, min_displacement_m=0.1, speed_adaptive=False)
 
 
 def run(settings, frames):
@@ -278,13 +279,22 @@ def test_a_track_that_was_away_begins_anew():
 
 def test_no_rows_and_no_pairs():
     none = np.zeros(0, np.intp)
-    rows = TrackRows(none, np.zeros(0), none, np.zeros(0, np.int8), np.zeros((0, 2)), none)
+    rows = TrackRows(
+        none,
+        np.zeros(0),
+        none,
+        np.zeros(0, np.int8),
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+        np.zeros(0, np.bool_),
+        none,
+    )
     for rule in RULES:
         verdicts = evaluate_rule(rows, pair_rows(rows), replace(SELECTED, rule=rule))
         assert len(verdicts.fires) == 0
     one = TrackRows(
         np.zeros(1, np.intp), np.zeros(1), np.ones(1, np.intp), np.ones(1, np.int8),
-        np.zeros((1, 2)), np.full(1, -1),
+        np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1, np.bool_), np.full(1, -1),
     )  # fmt: skip
     assert len(pair_rows(one)) == 0
 

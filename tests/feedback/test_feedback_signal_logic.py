@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bikeped.config.output_sections import FeedbackConfig
 from bikeped.faults import Fault
-from bikeped.feedback.signal_logic import OFF, STARTING, SignalLogic, fault_signal
+from bikeped.feedback.signal_logic import FRESH_S, OFF, STARTING, SignalLogic, fault_signal
 from bikeped.types import Colour, Signal, Sound, State
 
 FRAME_S = 1 / 30
@@ -50,7 +50,7 @@ def test_off_is_dark_and_silent() -> None:
 
 
 def test_configuration_sets_the_timings() -> None:
-    config = FeedbackConfig(blink_hz=3.0, fault_blink_hz=0.25, hold_alert_s=0.0, recover_frames=1)
+    config = FeedbackConfig(blink_hz=3.0, fault_blink_hz=0.25, recover_frames=1)
     logic = SignalLogic.from_config(config)
     assert logic.next_signal(0.0, None) == Signal("FAULT", Colour.ORANGE, 0.25, faults=(STARTING,))
     assert logic.next_signal(0.1, State.ALERT) == Signal("ALERT", Colour.RED, 3.0, Sound.BELL)
@@ -70,17 +70,17 @@ def test_a_tick_without_a_decision_keeps_the_state() -> None:
     assert logic.next_signal(now_s + 0.3, None).name == "WARNING"
 
 
-def test_one_frame_of_alert_is_held_and_then_gives_way() -> None:
-    logic, now_s = recovered(hold_alert_s=1.0)
+def test_an_alert_gives_way_with_the_decision() -> None:
+    logic, now_s = recovered()
     logic.next_signal(now_s, State.ALERT)
-    assert logic.next_signal(now_s + 0.99, State.IDLE).name == "ALERT"
-    assert logic.next_signal(now_s + 1.0, State.IDLE).name == "IDLE"
+    assert logic.next_signal(now_s + FRAME_S, State.ALERT, held=True).name == "ALERT"
+    assert logic.next_signal(now_s + 2 * FRAME_S, State.IDLE).name == "IDLE"
 
 
-def test_a_clock_that_steps_back_does_not_prolong_the_hold() -> None:
-    logic, now_s = recovered(hold_alert_s=1.0)
+def test_a_clock_that_steps_back_does_not_prolong_an_alert() -> None:
+    logic, now_s = recovered()
     logic.next_signal(now_s, State.ALERT)
-    assert logic.next_signal(now_s - 50, State.IDLE).name == "IDLE"
+    assert logic.next_signal(now_s - 50, None, CAMERA).name == "FAULT"
 
 
 def test_starts_in_fault_and_needs_good_frames_in_a_row() -> None:
@@ -129,23 +129,30 @@ def test_a_withheld_decision_shows_fault_only_for_blue_and_green() -> None:
     assert logic.next_signal(now_s + 9, State.SAFE).name == "SAFE"
 
 
-def test_a_held_alert_outlives_a_fault_only_by_its_hold() -> None:
-    logic, now_s = recovered(hold_alert_s=1.0)
+def test_a_fault_ends_a_hold_for_good() -> None:
+    logic, now_s = recovered()
     logic.next_signal(now_s, State.ALERT)
-    during = logic.next_signal(now_s + 0.5, None, CAMERA)
-    assert (during.name, during.faults) == ("ALERT", CAMERA)
-    assert logic.next_signal(now_s + 1.0, None, CAMERA).name == "FAULT"
+    logic.next_signal(now_s + 0.1, State.ALERT, held=True)
+    during = logic.next_signal(now_s + 0.15, State.ALERT, CAMERA, held=True)
+    assert (during.name, during.faults) == ("ALERT", CAMERA)  # of two frames ago: still fresh
+    assert logic.next_signal(now_s + 0.3, State.ALERT, CAMERA, held=True).name == "FAULT"
+    later = [
+        logic.next_signal(now_s + 0.4 + i * FRAME_S, State.ALERT, held=True).name for i in range(6)
+    ]
+    assert later == ["FAULT"] * 4 + ["WARNING"] * 2
 
 
 def test_a_fresh_alert_shows_during_recovery_and_falls_back_to_fault() -> None:
-    logic = SignalLogic(recover_frames=50, hold_alert_s=1.0)
+    logic = SignalLogic(recover_frames=50)
     assert logic.next_signal(0.0, State.ALERT).name == "ALERT"
+    assert logic.next_signal(0.1, State.ALERT, held=True).name == "ALERT"
     assert logic.next_signal(1.0, State.WARNING).name == "FAULT"
 
 
 def test_a_fresh_alert_shows_beside_a_fault_but_is_no_good_frame() -> None:
-    logic = SignalLogic(recover_frames=1, hold_alert_s=0.5)
+    logic = SignalLogic(recover_frames=1)
     assert logic.next_signal(0.0, State.ALERT, CAMERA).name == "ALERT"
+    assert logic.next_signal(0.1, None, CAMERA).name == "ALERT"  # a tick before the next frame
     assert logic.next_signal(0.6, None).name == "FAULT"
 
 
@@ -153,14 +160,13 @@ def test_a_fresh_alert_shows_beside_a_fault_but_is_no_good_frame() -> None:
     steps=st.lists(
         st.tuples(st.floats(0, 0.4), st.none() | st.sampled_from(State), st.booleans()), max_size=60
     ),
-    hold_s=st.floats(0, 2),
     recover=st.integers(1, 6),
 )
 @settings(deadline=None)
 def test_reassuring_colours_need_fresh_evidence(
-    steps: list[tuple[float, State | None, bool]], hold_s: float, recover: int
+    steps: list[tuple[float, State | None, bool]], recover: int
 ) -> None:
-    logic = SignalLogic(hold_alert_s=hold_s, recover_frames=recover)
+    logic = SignalLogic(recover_frames=recover)
     now_s, good = 0.0, 0
     for pause_s, state, faulty in steps:
         now_s += pause_s
@@ -186,32 +192,40 @@ def test_fault_and_alert_refuse_to_be_steady(blink_hz: float) -> None:
         SignalLogic(blink_hz=blink_hz)
 
 
-class Oracle:
-    """What must show, from the whole history of calls: the rules, not the way they are coded."""
+Call = tuple[float, "State | None", bool, "tuple[Fault, ...]"]
 
-    def __init__(self, recover_frames: int, hold_s: float) -> None:
-        self.recover_frames, self.hold_s = recover_frames, hold_s
-        self.calls: list[tuple[float, State | None, tuple[Fault, ...]]] = []
 
-    def name(self) -> str:
-        now_s, _, faults = self.calls[-1]
-        alerts = [t for t, state, _ in self.calls if state is State.ALERT]
-        if alerts and (now_s == alerts[-1] or now_s - alerts[-1] < self.hold_s):
-            return "ALERT"
-        stopped = [i + 1 for i, call in enumerate(self.calls) if CAMERA[0] in call[2]]
-        good = [state for _, state, _ in self.calls[max(stopped, default=0) :] if state is not None]
-        if CAMERA[0] in faults or len(good) < self.recover_frames:
-            return "FAULT"
-        withheld = faults and good[-1] in (State.IDLE, State.SAFE)
-        return "FAULT" if withheld else good[-1].name
+def expected(calls: list[Call], recover_frames: int) -> str:
+    """What must show after all calls: the rules, not the way they are coded."""
+    shown, good, alert_s = "FAULT", [], -math.inf
+    for now_s, state, held, faults in calls:
+        stopped = CAMERA[0] in faults
+        if state is State.ALERT and not held:
+            alert_s = now_s
+        elif state not in (None, State.ALERT) and not stopped:
+            alert_s = -math.inf
+        if stopped:
+            good = []
+        elif state is not None:
+            good.append(State.WARNING if held and shown != "ALERT" else state)
+        sure = len(good) >= recover_frames
+        alert = good[-1:] == [State.ALERT] and (sure or shown == "ALERT")
+        if alert or now_s - alert_s <= FRESH_S:
+            shown = "ALERT"
+        elif not sure or (faults and good[-1] in (State.IDLE, State.SAFE)):
+            shown = "FAULT"
+        else:
+            shown = good[-1].name
+    return shown
 
 
 def test_all_states_and_inputs() -> None:
-    """Every input in every state of the machine: four states and a tick; no fault, one that stops,
-    one that withholds, both; within the hold of an ALERT and after it."""
-    recover, hold_s, reached, walked = 2, 1.0, set(), set()
+    """Every input in every state of the machine: four states, a held one and a tick; no fault, one
+    that stops, one that withholds, both; while an ALERT is fresh and after it."""
+    recover, reached, walked = 2, set(), set()
     causes = ((), CAMERA, BLIND, CAMERA + BLIND)
-    inputs = list(itertools.product((None, *State), causes, (0.4, 1.5)))
+    decided = [(None, False), (State.ALERT, True), *((state, False) for state in State)]
+    inputs = list(itertools.product(decided, causes, (0.1, 0.4)))
     colours = {
         "IDLE": Colour.BLUE,
         "SAFE": Colour.GREEN,
@@ -220,16 +234,17 @@ def test_all_states_and_inputs() -> None:
         "FAULT": Colour.ORANGE,
     }
 
-    def walk(
-        logic: SignalLogic, calls: list[tuple[float, State | None, tuple[Fault, ...]]], shown: str
-    ) -> None:
-        for state, faults, pause_s in inputs:
-            oracle = Oracle(recover, hold_s)
+    def walk(logic: SignalLogic, calls: list[Call], shown: str) -> None:
+        for (state, held), faults, pause_s in inputs:
             now_s = (calls[-1][0] if calls else 0.0) + pause_s
-            oracle.calls = [*calls, (now_s, state, faults)]
+            made: list[Call] = [*calls, (now_s, state, held, faults)]
             after = copy.copy(logic)
-            signal = after.next_signal(now_s, state, faults)
-            assert signal.name == oracle.name(), oracle.calls
+            after._falls_s = list(logic._falls_s)
+            after._steady_from_s = -math.inf  # flicker has tests of its own
+            signal = after.next_signal(now_s, state, faults, held)
+            after._falls_s = []
+            after._steady_from_s = -math.inf
+            assert signal.name == expected(made, recover), made
             assert signal.colour is colours[signal.name]
             assert (signal.blink_hz > 0) == (signal.name in ("ALERT", "FAULT"))
             assert not (faults and signal.colour in (Colour.BLUE, Colour.GREEN))
@@ -239,19 +254,20 @@ def test_all_states_and_inputs() -> None:
             assert bool(signal.faults) == (signal.name == "FAULT" or bool(faults))
             if faults:
                 assert signal.faults == faults
-            reached.add((shown, state, faults, signal.name))
-            alert_s = now_s - (after._alert_s or -hold_s)
+            reached.add((shown, state, held, faults, signal.name))
+            alert_s = min(now_s - after._alert_s, 2 * FRESH_S)
             kept = (after._good_frames, after._decided, after._recovering_from, after._shown)
-            machine = (*kept, round(min(alert_s, hold_s), 3))
+            machine = (*kept, round(alert_s, 3))
             if machine not in walked:
                 walked.add(machine)
-                walk(after, oracle.calls, signal.name)
+                walk(after, made, signal.name)
 
-    walk(SignalLogic(recover_frames=recover, hold_alert_s=hold_s), [], "FAULT")
-    shown_before = {before for before, _, _, _ in reached}
+    walk(SignalLogic(recover_frames=recover), [], "FAULT")
+    shown_before = {before for before, *_ in reached}
     assert shown_before == set(colours)
     # From every shown state, every input was tried.
-    assert len({(b, s, f) for b, s, f, _ in reached}) == len(colours) * 5 * len(causes)
+    tried = len({(b, s, h, f) for b, s, h, f, _ in reached})
+    assert tried == len(colours) * len(decided) * len(causes)
 
 
 def test_every_pair_of_states_follows_at_once_outside_alert() -> None:

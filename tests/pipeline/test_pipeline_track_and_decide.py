@@ -82,9 +82,9 @@ def test_the_rule_is_asked_about_the_place_ahead_by_age_and_offset_up_to_the_bou
     asked = []
     decide = track_and_decide._decider.decide
 
-    def watched(captured_s, number, kind, xy_m):
+    def watched(captured_s, number, kind, xy_m, *more):
         asked.append(xy_m)
-        return decide(captured_s, number, kind, xy_m)
+        return decide(captured_s, number, kind, xy_m, *more)
 
     monkeypatch.setattr(track_and_decide._decider, "decide", watched)
     for frame in range(90):

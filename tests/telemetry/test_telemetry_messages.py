@@ -222,7 +222,8 @@ def test_the_numbers_of_checks_and_drift():
 def test_event_line_exactly_and_in_order():
     line = m.encode_line(event_line())
     assert line == (
-        b'{"t":1.2346,"frame":42,"state":"ALERT","light":"ALERT","faults":[],"pair":[7,3],"tracks":['
+        b'{"t":1.2346,"frame":42,"state":"ALERT","raw_state":"ALERT","light":"ALERT",'
+        b'"faults":[],"pair":[7,3],"tracks":['
         b'{"id":3,"kind":"pedestrian","x":3.0,"y":4.0,"vx":0.0,"vy":0.0,"lost":true},'
         b'{"id":7,"kind":"cyclist","x":0.0,"y":12.346,"vx":3.0,"vy":-4.0,"lost":false}],'
         b'"detections":[{"kind":"cyclist","confidence":0.1,"box":[1.0,2.1,3.0,4.0]}],'

@@ -19,7 +19,8 @@ from bikeped.decision.rules import (
     is_remembered,
     resolve_state,
 )
-from bikeped.decision.track_rows import Pairs, TrackRows, pair_rows
+from bikeped.decision.track_rows import Pairs, TrackRows
+from bikeped.decision.who_counts import counted_pairs, counts
 from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 from bikeped.tracking.tracker import predict
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
@@ -27,6 +28,7 @@ from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
 FPS = 30.0
 #: The paper's simulation tracker (definitions, section 7): the defaults of TrackerSettings.
 SIMULATION_TRACKER = TrackerSettings()
+DEFAULT_RULE = RuleSettings()
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class DetectionSequence:
 
 
 #: The tracker's arrays that a history keeps, in the order of `TrackHistory`.
-_STATE = ("reported", "id", "kind", "xy_m", "velocity_mps", "acceleration_mps2")
+_STATE = ("reported", "id", "kind", "xy_m", "velocity_mps", "acceleration_mps2", "seen_s", "parked")
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class TrackHistory:
     xy_m: FloatArray
     velocity_mps: FloatArray
     acceleration_mps2: FloatArray
+    seen_s: FloatArray
+    parked: BoolArray
     frames: IntArray  #: [batch]: frames of each element; later ones are padding
     delay_frames: IntArray  #: [batch]
 
@@ -114,6 +118,7 @@ def delay_history(history: TrackHistory, frames: int) -> TrackHistory:
         arrays[name] = np.zeros_like(array)
         arrays[name][late:] = array[: longest - late]
     arrays["reported"] &= (np.arange(longest)[:, None] < history.frames[None, :])[..., None]
+    arrays["seen_s"] += frames / FPS
     return replace(history, **arrays, delay_frames=history.delay_frames + frames)
 
 
@@ -128,8 +133,8 @@ class RuleInput:
     """Track rows of the whole batch with their pairs: the input of any number of rules.
 
     Frames are numbered over all elements in turn: `start[index] + i` is frame i of an element.
-    `time_s`, `pedestrian` (one is tracked) and `cyclist_last_s` (time of the last cyclist; -inf
-    before the first) are by frame.
+    `time_s`, `pedestrian` (one counts as present) and `cyclist_last_s` (time of the last cyclist
+    that counts; -inf before the first) are by frame.
     """
 
     rows: TrackRows
@@ -146,10 +151,13 @@ class RuleInput:
         return slice(begin, begin + int(self.frames[index]))
 
 
-def build_rule_input(history: TrackHistory, order: int = 0) -> RuleInput:
+def build_rule_input(
+    history: TrackHistory, order: int = 0, settings: RuleSettings = DEFAULT_RULE
+) -> RuleInput:
     """The rows that the rules read, predicted ahead by each element's delay.
 
-    `order` of the prediction: 0 none, 1 velocity, 2 acceleration.
+    `order` of the prediction: 0 none, 1 velocity, 2 acceleration. Of the `settings` only those that
+    say who counts: `max_unseen_s` and `count_all`.
     """
     # Element-major order, so that an element's frames are neighbours.
     reported = history.reported.transpose(1, 0, 2)
@@ -167,6 +175,8 @@ def build_rule_input(history: TrackHistory, order: int = 0) -> RuleInput:
     same = (before >= 0) & (ids[np.maximum(before, 0)] == ids)
     total = int(history.frames.sum())
     at = (frame, element, slot)
+    unseen_s = frame / FPS - history.seen_s[at]
+    counted = counts(unseen_s, history.parked[at], settings.max_unseen_s) | settings.count_all
     rows = TrackRows(
         frame=(start[element] + frame).astype(np.intp),
         time_s=frame / FPS,
@@ -179,21 +189,26 @@ def build_rule_input(history: TrackHistory, order: int = 0) -> RuleInput:
             (history.delay_frames / FPS)[element][:, None],
             order,
         ),
+        velocity_mps=history.velocity_mps[at],
+        counts=counted,
         previous=np.where(same, before, -1),
     )
     time_s = np.concatenate([np.arange(n) / FPS for n in history.frames])
-    cyclist = np.bincount(rows.frame[rows.kind == int(Kind.CYCLIST)], minlength=total) > 0
-    last = np.where(cyclist, time_s, -np.inf)
+    present = {
+        kind: np.bincount(rows.frame[counted & (rows.kind == int(kind))], minlength=total) > 0
+        for kind in (Kind.CYCLIST, Kind.PEDESTRIAN)
+    }
+    last = np.where(present[Kind.CYCLIST], time_s, -np.inf)
     for begin, count in zip(start, history.frames, strict=True):
         part = last[begin : begin + count]
         np.maximum.accumulate(part, out=part)
     return RuleInput(
         rows=rows,
-        pairs=pair_rows(rows),
+        pairs=counted_pairs(rows, count_all=settings.count_all),
         start=start,
         frames=history.frames,
         time_s=time_s,
-        pedestrian=np.bincount(rows.frame[rows.kind == int(Kind.PEDESTRIAN)], minlength=total) > 0,
+        pedestrian=present[Kind.PEDESTRIAN],
         cyclist_last_s=last,
     )
 
@@ -206,7 +221,7 @@ def verdicts(run: RuleInput, settings: RuleSettings) -> PairChecks:
 def states(
     run: RuleInput, settings: RuleSettings
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
-    """State codes of every frame, element after element."""
+    """Raw state codes of every frame, element after element."""
     fired = verdicts(run, settings).fires
     approaching = (
         np.bincount(run.rows.frame[run.pairs.pedestrian_row[fired]], minlength=len(run.time_s)) > 0

@@ -15,6 +15,7 @@ import pytest
 from bikeped.config.build import rule_settings
 from bikeped.config.load import load_config
 from bikeped.decision.decider import Decider
+from bikeped.decision.who_counts import counts
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.simulate import FPS, SIMULATION_TRACKER
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
@@ -35,7 +36,11 @@ def trace(name, scene):
     for frame, there in enumerate(scene.detected):
         points = GroundPoints(scene.kind[there], scene.xy_m[frame][there], np.flatnonzero(there))
         tracks = tracker.update(points, frame / FPS)
-        decision = decider.decide(frame / FPS, tracks.id, tracks.kind, tracks.xy_m)
+        velocity_mps, _ = tracker.smoothed()
+        counted = counts(tracks.unseen_s, tracker.parked(), decider.settings.max_unseen_s)
+        decision = decider.decide(
+            frame / FPS, tracks.id, tracks.kind, tracks.xy_m, velocity_mps, counted
+        )
         pair = decision.pair
         key = decision.state.name, pair and (pair.cyclist_id, pair.pedestrian_id)
         distance = pair and pair.distance_m

@@ -8,6 +8,7 @@ from detection_losses import misses
 
 from bikeped.config.build import rule_settings
 from bikeped.decision.decider import Decider
+from bikeped.decision.who_counts import counts
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
 from bikeped.lab.simulation.perception import RecallModel, trial_generator
 from bikeped.lab.simulation.simulate import (
@@ -42,8 +43,9 @@ def deployed(scene, rules, orders=(0,)):
         found.append([])
         for order, decider in zip(orders, deciders, strict=True):
             ahead = predict(tracks.xy_m, velocity, acceleration, scene.delay_frames / FPS, order)
-            decision = decider.decide(frame / FPS, tracks.id, tracks.kind, ahead)
-            found[-1].append(int(decision.state))
+            counted = counts(tracks.unseen_s, tracker.parked(), rules.max_unseen_s)
+            decision = decider.decide(frame / FPS, tracks.id, tracks.kind, ahead, velocity, counted)
+            found[-1].append(int(decision.raw))
     return np.array(found, np.int8).T
 
 

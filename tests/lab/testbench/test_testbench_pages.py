@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -12,6 +13,7 @@ from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 from bikeped.config.build import rule_settings
 from bikeped.config.schema import DecisionConfig
 from bikeped.decision.decider import Decider
+from bikeped.decision.shown import AS_RAW
 from bikeped.lab.experiments.latency import sweep
 from bikeped.lab.experiments.trials import (
     LossModel,
@@ -131,7 +133,8 @@ def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
     one = work.shown_suite(bench(name))
     play = playback(one, 0, {rule: decision})
     side = play["sides"][0]
-    decider, rows = Decider(rule_settings(decision)), one.rule_input.rows
+    decider = Decider(replace(rule_settings(decision), shown=AS_RAW))
+    rows = one.rule_input.rows
     for frame in range(play["frames"]):
         at = rows.frame == frame
         told = decider.decide(frame / 30, rows.id[at], rows.kind[at], rows.xy_m[at])
