@@ -148,6 +148,7 @@ FAULT_KINDS: dict[str, FaultKind] = {
         _minor("camera.slow", "camera", "Less than half of the camera's frames arrive."),
         _minor("service.slow", "service", "The light follows the picture too late."),
         _minor("speaker.error", "speaker", "A sound could not be played."),
+        _minor("service.same_site", "service", "Another service publishes under this site's name."),
         _minor("audit.error", "audit", "The audit log cannot be written."),
     )
 }

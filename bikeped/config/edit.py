@@ -56,6 +56,14 @@ def replace_section(
     return _checked(text, after, section, values, source)
 
 
+def completed(text: str) -> str:
+    """`text` with `complete: true` as its last line, if it is not there."""
+    if "complete" in load_yaml(text):
+        return text
+    newline = "\r\n" if "\r\n" in text else "\n"
+    return text + ("" if text.endswith("\n") else newline) + "complete: true" + newline
+
+
 def section_lines(section: str, values: Mapping[str, Any], note: str = "") -> list[str]:
     """The lines of a section, without line ends."""
     head = f"{section}:  # {note}" if note else f"{section}:"

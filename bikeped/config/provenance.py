@@ -19,7 +19,7 @@ from bikeped import __version__
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig
 from bikeped.files import read_regular
-from bikeped.models import model_file
+from bikeped.models import model_file, model_sha256
 
 #: What turns detections into a state on the pole; the simulation runs the same rule and tracker.
 DECIDING_CODE = ("config/build", "decision", "geometry", "pipeline/track_and_decide", "tracking")
@@ -89,7 +89,7 @@ def setting_hashes(loaded: LoadedConfig) -> dict[str, str]:
     model_hash = detection.sha256 and detection.sha256.lower()
     file = None if detection.model is None else model_file(detection.model, loaded.base_dir)
     if file is not None and file.is_file():
-        model_hash = hashlib.sha256(file.read_bytes()).hexdigest()
+        model_hash = model_sha256(file)
     kinds = (detection.pedestrian, detection.cyclist, detection.vehicle)
     return {
         "decision_hash": decision_hash(config.decision),

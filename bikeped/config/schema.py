@@ -106,8 +106,9 @@ class DetectionConfig(Section, frozen=True):
     bikeped, trained on drawn streets only, for demo and self-test, never for a street; null:
     none"""
     sha256: Annotated[str, Meta(pattern="^[0-9a-fA-F]{64}$")] | None = None
-    """SHA-256 of the model file, refused when different (weights in files beside it are not
-    covered); null: any (the bundled model is always checked)"""
+    """SHA-256 of the model file and of the files beside it that hold its weights, refused when
+    different; written when a configuration is promoted; null: any (the bundled model is always
+    checked)"""
     layout: Literal["auto", "yolov5", "yolov8", "end2end", "yolox", "yolox-decoded"] = "auto"
     """output layout: yolov5 also v7; yolov8 also v9, v11, v12; end2end also v10 and 26; auto tells
     them apart by metadata and shapes"""

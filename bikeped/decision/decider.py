@@ -15,8 +15,8 @@ from bikeped.decision.rules import (
     resolve_state,
 )
 from bikeped.decision.shown import ShownAlert, shown_states
-from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows
-from bikeped.decision.who_counts import RIDER_S, counted_pairs
+from bikeped.decision.track_rows import CYCLIST, PEDESTRIAN, Pairs, RowBuffer, TrackRows, pair_rows
+from bikeped.decision.who_counts import RIDER_S
 from bikeped.types import BoolArray, Decision, FloatArray, IntArray, KindArray, PairMetrics, State
 
 
@@ -53,7 +53,7 @@ class Decider:
         if counted is None:
             counted = np.ones(len(ids), np.bool_)
         rows, newest = self._buffer.append(time_s, ids, kind, xy_m, velocity_mps, counted)
-        pairs = counted_pairs(rows, newest, self.settings.count_all)
+        pairs = pair_rows(rows, newest)
         checks = evaluate_rule(rows, pairs, self.settings)
         if np.count_nonzero((kind == CYCLIST) & counted):
             self._last_cyclist_s = time_s

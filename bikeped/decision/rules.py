@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from bikeped.decision.shown import ShownSettings
 from bikeped.decision.track_rows import EPSILON_S, IndexArray, Pairs, TrackRows
+from bikeped.decision.who_counts import without_riders
 from bikeped.types import BoolArray, FloatArray, State
 
 RuleName = Literal["pairwise", "naive", "ttc", "distance"]
@@ -62,7 +63,7 @@ class PairChecks:
     `evaluated`, `closing` and `displacement_ok` (the cyclist's displacement exceeds the minimum;
     rule ttc: time to collision below `ttc_s`; rule distance: always). `evaluated` is false for
     pairs that fail one of the first three or have no earlier position: these have a lookback of
-    0 s, no displacement, and neither of the last two.
+    0 s, no displacement, and neither of the last two. One rider (`who_counts`) does not fire.
     """
 
     fires: BoolArray
@@ -125,8 +126,9 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
     closing, displacement_ok = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     closing[index] = is_closing & evaluated[index]
     displacement_ok[index] = second_check & evaluated[index]
+    fires = closing & displacement_ok
     return PairChecks(
-        fires=closing & displacement_ok,
+        fires=fires if settings.count_all else without_riders(rows, pairs, fires),
         evaluated=evaluated,
         above_d_min=above_d_min,
         below_d_max=below_d_max,

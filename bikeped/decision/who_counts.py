@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bikeped.decision.track_rows import EPSILON_S, IndexArray, Pairs, TrackRows, pair_rows
+from bikeped.decision.track_rows import EPSILON_S, IndexArray, Pairs, TrackRows
 from bikeped.types import BoolArray, FloatArray
 
 #: A cyclist and a pedestrian no farther apart and no different in velocity, for so long, are one
@@ -21,41 +21,26 @@ def counts(unseen_s: FloatArray, parked: BoolArray, max_unseen_s: float) -> Bool
     return np.asarray((unseen_s <= max_unseen_s + EPSILON_S) & ~parked)
 
 
-def counted_pairs(rows: TrackRows, first_row: int = 0, count_all: bool = False) -> Pairs:
-    """The cyclist-pedestrian pairs of the rows from `first_row` on that a rule may judge.
-
-    `count_all`: riders are not told apart, as in the paper's simulation.
-    """
-    pairs = pair_rows(rows, first_row)
-    if count_all or len(pairs) == 0:
-        return pairs
-    rider = _one_rider(rows, pairs)
-    return pairs.take(~rider) if np.count_nonzero(rider) else pairs
-
-
-def _one_rider(rows: TrackRows, pairs: Pairs) -> BoolArray:
-    """[m]: the pairs that move alike, and those too young to tell that were always near."""
-    cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist], pairs.pedestrian_row
-    rider: BoolArray = np.zeros(len(pairs), np.bool_)
-    index = _near(rows, cyclist, pedestrian).nonzero()[0]
-    if len(index) == 0:
-        return rider
-    cyclist, pedestrian = cyclist[index], pedestrian[index]
+def without_riders(rows: TrackRows, pairs: Pairs, fires: BoolArray) -> BoolArray:
+    """`fires` [m] without the pairs that are one rider: that move alike, or are too young to tell
+    and were always near. Only pairs that fire are looked at."""
+    index = fires.nonzero()[0]
+    cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist[index]], pairs.pedestrian_row[index]
     since_s = rows.time_s[cyclist] - (RIDER_S - EPSILON_S)
     alike: BoolArray = np.ones(len(index), np.bool_)
-    while True:
+    fires = fires.copy()
+    while len(index):
         near = _near(rows, cyclist, pedestrian)
         difference = rows.velocity_mps[cyclist] - rows.velocity_mps[pedestrian]
         alike &= near & ((difference**2).sum(-1) <= RIDER_MPS**2)
         old = rows.time_s[cyclist] <= since_s
         before = rows.previous[cyclist], rows.previous[pedestrian]
         young = ~old & ((before[0] < 0) | (before[1] < 0))
-        rider[index] |= (old & alike) | (young & near)
+        fires[index[(old & alike) | (young & near)]] = False
         go = near & ~old & ~young
-        if not np.count_nonzero(go):
-            return rider
         index, since_s, alike = index[go], since_s[go], alike[go]
         cyclist, pedestrian = before[0][go], before[1][go]
+    return fires
 
 
 def _near(rows: TrackRows, cyclist: IndexArray, pedestrian: IndexArray) -> BoolArray:

@@ -6,7 +6,6 @@ arrays. Everything else is common to both and lives in the pure modules of this 
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 import time
@@ -30,7 +29,7 @@ from bikeped.detection.output_layouts import Candidates, Layout, choose_layout, 
 from bikeped.detection.person_boxes import join_riders, suppress_partial_person_boxes
 from bikeped.detection.preprocess import PAD, Family, Letterbox, Preprocessor
 from bikeped.errors import DetectorError
-from bikeped.models import BUNDLED_SHA256, model_file
+from bikeped.models import BUNDLED_SHA256, model_file, model_sha256
 from bikeped.types import (
     BoolArray,
     Detections,
@@ -48,7 +47,6 @@ log = logging.getLogger(__name__)
 RIDDEN_CONFIDENCE_SHARE = 0.5
 #: Suppression takes at most this many candidates, the strongest: it bounds its time.
 MAX_CANDIDATES = 4096
-_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -297,22 +295,20 @@ def _family(
 
 
 def sha256_of(path: Path, expected: str | None = None) -> str:
-    """The file's SHA-256 in lower-case hexadecimal, read in chunks of 1 MiB.
+    """The model's SHA-256 in lower-case hexadecimal (`model_sha256`).
 
     Raises `DetectorError` where the file cannot be read or is not `expected`, `detection.sha256`.
     """
-    digest = hashlib.sha256()
     try:
-        with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                digest.update(chunk)
-    except FileNotFoundError:
+        actual = model_sha256(path)
+    except FileNotFoundError as error:
         raise DetectorError(
-            f"{path}: no such model file; correct detection.model or put the file there"
+            f"{error.filename}: no such model file; correct detection.model or put the file there"
         ) from None
+    except ValueError:  # mmap's word for an empty file
+        raise DetectorError(f"{path}: is empty; put the model there") from None
     except OSError as error:
         raise DetectorError(f"{path}: cannot read the model file: {error.strerror}") from error
-    actual = digest.hexdigest()
     if expected is not None and expected.lower() != actual:
         raise DetectorError(
             f"{path}: SHA-256 is {actual} but detection.sha256 expects {expected.lower()}; "

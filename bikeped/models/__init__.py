@@ -5,6 +5,10 @@ It was trained on drawn streets only; docs/bundled-detector.md has its figures a
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 #: Value of `detection.model` for the bundled model.
@@ -30,3 +34,27 @@ def model_file(model: str, base_dir: Path, *, on_cpu: bool = False) -> Path:
     if model == BUNDLED:
         return BUNDLED_INT8_FILE if on_cpu else BUNDLED_FILE
     return base_dir / Path(model).expanduser()
+
+
+#: A tensor's `location` in an ONNX file: key and value of a protobuf entry, each with its length.
+_LOCATION = re.compile(rb"\x0a\x08location\x12([\x80-\xff]*[\x00-\x7f])", re.DOTALL)
+
+
+def model_sha256(path: Path) -> str:
+    """SHA-256 of a model: of its file, and then of the files beside it that hold its weights.
+
+    `cat model.onnx model.onnx.data | sha256sum` gives the same; several such files follow in the
+    order of their names. Raises OSError where one cannot be read.
+    """
+    digest, weights = hashlib.sha256(), set()
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        digest.update(data)
+        if path.suffix.lower() == ".onnx":
+            for found in _LOCATION.finditer(data):
+                length = sum((b & 0x7F) << (7 * i) for i, b in enumerate(found[1]))
+                weights.add(data[found.end() : found.end() + length])
+    for name in sorted(weights):
+        with (path.parent / os.fsdecode(name)).open("rb") as file:
+            while chunk := file.read(1 << 20):
+                digest.update(chunk)
+    return digest.hexdigest()

@@ -162,6 +162,7 @@ class Application:
                 *fault_sources,
                 lambda: None if speaker is None else speaker.fault,
                 lambda: None if audit is None else audit.fault,
+                lambda: None if publisher is None else publisher.fault,
                 lambda: light.fault,
                 lambda: track_and_decide.fault,
                 lambda: None if loaded.config.monitor.picture else UNCHECKED,

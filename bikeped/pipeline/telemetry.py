@@ -166,6 +166,7 @@ class Telemetry:
             faults=list(fault_texts(faults)),
             fault_codes=[fault.code for fault in faults],
             counters=self._counters(loop),
+            instance="" if self._mqtt is None else self._mqtt.instance,
         )
 
     def _faults(self, loop: Loop) -> tuple[Fault, ...]:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO
 
@@ -239,8 +240,12 @@ class AuditLog:
         # Unbuffered: after a failed write nothing waits in Python that close() would try again.
         self._file = path.open("ab", buffering=0)
         self._size = os.fstat(self._file.fileno()).st_size
-        if self._size and not _ends_with_newline(path):
-            self._write_all(self._file, b"\n")  # a power cut tore the last line
+        whole = _whole_lines(path) if self._size else 0
+        if whole < self._size:
+            lost = self._size - whole
+            log.warning("audit: %s: cut %d bytes of a torn last line (power cut?)", path, lost)
+            os.ftruncate(self._file.fileno(), whole)
+            self._size = whole
         self._write_all(self._file, self._header)
 
     def _write_all(self, file: BinaryIO, data: bytes) -> None:
@@ -291,7 +296,7 @@ def _numbered(path: Path, number: int) -> Path:
     return path.with_name(f"{path.name}.{number}")
 
 
-def _ends_with_newline(path: Path) -> bool:
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        return file.read(1) == b"\n"
+def _whole_lines(path: Path) -> int:
+    """Bytes up to the end of the last whole line: after a power cut half a line or zeros follow."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        return data.rfind(b"\n") + 1

@@ -12,15 +12,19 @@ import contextlib
 import logging
 import math
 import random
+import secrets
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
+
 from bikeped import __version__
 from bikeped.config.output_sections import MqttConfig
 from bikeped.errors import TelemetryError
+from bikeped.faults import Fault
 from bikeped.telemetry.homeassistant import discovery_messages
 from bikeped.telemetry.mqtt_connection import (
     BrokerConnection,
@@ -32,7 +36,17 @@ from bikeped.telemetry.mqtt_connection import (
 
 log = logging.getLogger(__name__)
 
+OTHER_SITE_S = 60.0  #: so long after its last health another service of one name is named
 TURN_S = 0.1  #: longest time between two looks at what the broker sends
+
+
+class _Instance(msgspec.Struct):
+    """What of a health message tells who wrote it."""
+
+    instance: str
+
+
+_decode_instance = msgspec.json.Decoder(_Instance).decode
 
 
 @dataclass
@@ -78,6 +92,8 @@ class MqttPublisher:
         if sends_password_in_clear(config):
             log.warning("mqtt: the password goes to %s unencrypted: set mqtt.tls", config.host)
         self._topic = f"bikeped/{config.site}/"
+        #: In the client's name and in health: tells two services of one site's name apart.
+        self.instance = secrets.token_hex(4)
         self._discovery = discovery_messages(config, version) if config.home_assistant else {}
         self._backoff_s = backoff_s
         self._io_timeout_s = io_timeout_s
@@ -92,6 +108,8 @@ class MqttPublisher:
         self._unsent: dict[str, None] = {}  #: topics of `_retained` to send, in order
         self._status = MqttStatus()
         self._stopping = False
+        self._open = False  #: a connection stands, whether or not messages are confirmed
+        self._other_s = -math.inf  #: when another service of this site's name was last heard
         self._stop_by_s = math.inf  #: when a wait for the broker ends that `stop` interrupts
 
     @property
@@ -137,7 +155,7 @@ class MqttPublisher:
             return
         with self._changed:
             self._stopping = True
-            wait_s = self._stop_timeout_s if self._status.connected else 0.0
+            wait_s = self._stop_timeout_s if self._open else 0.0
             self._stop_by_s = time.monotonic() + wait_s
             self._changed.notify_all()
         self._thread.join(wait_s)
@@ -176,17 +194,20 @@ class MqttPublisher:
         connection = BrokerConnection(
             self.config,
             self._credentials,
-            # One name a site makes the broker end a half-open older connection (and publish its
-            # will) before it accepts this one; under another name that will would come later and
-            # leave a living pole `offline`.
-            client_id=f"bikeped-{self.config.site}",
+            # One name a process makes the broker end its half-open older connection (and publish
+            # the will) before it accepts this one. Another service of this site's name has another:
+            # two that throw each other off would both be lost.
+            client_id=f"bikeped-{self.config.site}-{self.instance}",
             timeout_s=self._io_timeout_s,
             will=self._availability(b"offline"),
             cancelled=lambda: time.monotonic() >= self._stop_by_s,
         )
-        with contextlib.closing(connection):
-            connection.open()
-            self._send(connection)
+        try:
+            with contextlib.closing(connection):
+                connection.open()
+                self._send(connection)
+        finally:
+            self._open = False
 
     def _send(self, connection: BrokerConnection) -> None:
         """Sends what waits, as it comes, until stopped; then says goodbye."""
@@ -197,13 +218,12 @@ class MqttPublisher:
         self._send_retained(connection)
         # Only now: who reads `online` finds values of this connection, not of an earlier one.
         connection.keep(self._availability(b"online"))
-        with self._changed:
-            self._status.connects += 1
-            self._status.error = None
-            self._status.connected = not self._stopping
-        log.info("mqtt: connected to %s:%d", self.config.host, self.config.port)
+        connection.watch(self._topic + "health", self._on_health)
+        self._open, confirm_by_s = True, time.monotonic() + self._io_timeout_s
         while not self._stopping:
             connection.turn()
+            if not self._status.connected:
+                self._confirm(connection, confirm_by_s)
             self._send_retained(connection)  # a change of state never waits behind tracks
             with self._changed:
                 self._changed.wait_for(self._has_work, TURN_S)
@@ -212,6 +232,34 @@ class MqttPublisher:
                 self._send_one(connection, message)
         self._send_retained(connection)
         connection.goodbye(self._availability(b"offline"))
+
+    def _confirm(self, connection: BrokerConnection, latest_s: float) -> None:
+        """Connected is what the broker passes on to us: access rules drop messages in silence."""
+        if connection.confirmed:
+            with self._changed:
+                self._status.connects += 1
+                self._status.error = None
+                self._status.connected = not self._stopping
+            log.info("mqtt: connected to %s:%d", self.config.host, self.config.port)
+        elif time.monotonic() > latest_s:
+            self._set_failure(
+                f"{self.config.host}:{self.config.port} passes nothing on under {self._topic}: "
+                "check the broker's access rules (read and write)"
+            )
+
+    def _on_health(self, payload: bytes) -> None:
+        """Health under our topic; another process's has another instance."""
+        with contextlib.suppress(msgspec.MsgspecError):
+            if _decode_instance(payload).instance != self.instance:
+                self._other_s = time.monotonic()
+
+    @property
+    def fault(self) -> Fault | None:
+        """Another service publishes under this site's name, heard within the last minute."""
+        if time.monotonic() - self._other_s > OTHER_SITE_S:
+            return None
+        detail = f"another service publishes as {self._topic}: give each its own mqtt.site"
+        return Fault("mqtt", "service.same_site", detail)
 
     def _has_work(self) -> bool:
         return bool(self._unsent or self._queue or self._stopping)

@@ -8,6 +8,7 @@ is used once, and works only while it is called.
 from __future__ import annotations
 
 import contextlib
+import math
 import ssl
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +25,8 @@ from bikeped.errors import TelemetryError
 
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 _TURN_S = 0.05  #: between two looks at `cancelled` during a wait
+#: Of `mqtt.keepalive_s`, what the broker is asked to watch.
+KEEPALIVE_SHARE = 0.6
 
 
 class MqttMessage(NamedTuple):
@@ -58,6 +61,7 @@ class BrokerConnection:
     ) -> None:
         self._config, self._timeout_s, self._cancelled = config, timeout_s, cancelled
         self._answers: list[ReasonCode] = []
+        self._echoes: list[str] = []
         answers = self._answers  # without `self`: paho's sockets close without the collector
         self._client = client = Client(
             CallbackAPIVersion.VERSION2, client_id, reconnect_on_failure=False
@@ -73,7 +77,10 @@ class BrokerConnection:
 
     def open(self) -> None:
         """Connects and waits until the broker has accepted the client."""
-        self._client.connect(self._config.host, self._config.port, self._config.keepalive_s)
+        # The broker gives a silent client up after 1.5 times this, and looks only now and then:
+        # less on the wire, so that the will comes within 1.5 times the configured time.
+        keepalive_s = max(1, math.floor(self._config.keepalive_s * KEEPALIVE_SHARE))
+        self._client.connect(self._config.host, self._config.port, keepalive_s)
         self._wait(lambda: bool(self._answers), "CONNACK")
 
     def publish(self, message: MqttMessage) -> None:
@@ -84,15 +91,37 @@ class BrokerConnection:
         self._wait(sent.is_published, "PUBACK" if message.qos else "to take data")
 
     def keep(self, message: MqttMessage) -> None:
-        """Publishes a message, and again whenever another client publishes under its topic."""
+        """Publishes a message, and again whenever another client publishes under its topic.
+
+        `confirmed` once the broker has passed it on to us.
+        """
+        echoes = self._echoes
 
         def restore(client: Client, _data: Any, received: MQTTMessage) -> None:
-            if received.payload != message.payload:
+            if received.payload == message.payload:
+                echoes.append(received.topic)
+            else:
                 client.publish(*message)
 
         self.publish(message)
-        self._client.on_message = restore
+        self._client.message_callback_add(message.topic, restore)
         self._client.subscribe(message.topic, 1)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the broker has passed on a message of ours: it acknowledges those that its access
+        rules forbid, too, and drops them."""
+        return bool(self._echoes)
+
+    def watch(self, topic: str, received: Callable[[bytes], None]) -> None:
+        """Calls `received` with what is published under `topic` from now on."""
+
+        def take(_client: Client, _data: Any, message: MQTTMessage) -> None:
+            if not message.retain:
+                received(bytes(message.payload))
+
+        self._client.message_callback_add(topic, take)
+        self._client.subscribe(topic, 0)
 
     def turn(self, wait_s: float = 0.0) -> None:
         """Receives and sends what is due; waits for it at most `wait_s`."""
@@ -103,7 +132,7 @@ class BrokerConnection:
 
     def goodbye(self, message: MqttMessage) -> None:
         """Publishes a last message and disconnects; the broker then keeps the will to itself."""
-        self._client.on_message = None
+        self._client.message_callback_remove(message.topic)
         self.publish(message)
         self._client.disconnect()
 

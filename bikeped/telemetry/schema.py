@@ -182,6 +182,7 @@ class HealthMessage(msgspec.Struct, frozen=True, kw_only=True):
         list[str], Meta(description="codes of `faults`, in their order (docs/faults-reference.md)")
     ]
     counters: Counters
+    instance: Annotated[str, Meta(description="of the process; others under one site are noticed")]
 
 
 class EventHeader(msgspec.Struct, frozen=True, kw_only=True):

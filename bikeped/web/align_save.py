@@ -12,7 +12,7 @@ from pathlib import Path
 
 import bikeped
 from bikeped.config.build import framing, ground_camera
-from bikeped.config.edit import section_lines, set_values
+from bikeped.config.edit import completed, section_lines, set_values
 from bikeped.config.load import load_config, parse_config
 from bikeped.config.provenance import provenance_path
 from bikeped.errors import ConfigError, GeometryError
@@ -100,6 +100,7 @@ def save(
     _check_same(path, text, sha256)
     new = rounded(values)
     after = set_values(text, {"camera": new}, str(path))
+    after = completed(after)
     loaded = parse_config(after, str(path), path.parent)  # names a value that is out of range
     content, no_reference = None, "there is no picture"
     if picture is not None:

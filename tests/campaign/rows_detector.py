@@ -80,7 +80,8 @@ def crowded(rig: Rig) -> None:
     latency = service.health()[1]["latency_ms"]
     names = [name for name in ("track", "decide", "tracking", "decision") if name in latency]
     rig.measure("p99 of the decision", sum(latency[name]["p99"] for name in names))
-    rig.saw(f"stages {', '.join(names)}; {len(crowd(2000, 96, 64))} boxes offered")
+    stages = ", ".join(f"{name} {latency[name]}" for name in names)
+    rig.saw(f"{stages}; {len(crowd(2000, 96, 64))} boxes offered")
 
 
 @row(17, "the detector answers nothing, while road users move", "withheld", "FAULT <= 60 s")

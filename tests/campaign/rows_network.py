@@ -43,8 +43,10 @@ class Listener:
         return float("inf")
 
 
-def _config(rig: Rig, port: int, more: str = "") -> Path:
-    return rig.config(f"  enabled: true\n  host: 127.0.0.1\n  port: {port}\n{more}" + WEB)
+def mqtt_config(rig: Rig, port: int, more: str = "", name: str = "pole.yaml") -> Path:
+    """A configuration that publishes to the broker at `port`; `more` are further lines of mqtt."""
+    mqtt = f"  enabled: true\n  host: 127.0.0.1\n  port: {port}\n{more}"
+    return rig.config(mqtt + WEB, name=name)
 
 
 @row(
@@ -58,7 +60,7 @@ def broker_absent(rig: Rig) -> None:
     for _ in rig.repetitions:
         broker = rig.broker()
         broker.kill()
-        service = rig.start(_config(rig, broker.port))
+        service = rig.start(mqtt_config(rig, broker.port))
         service.settle()
         time.sleep(20)
         broker.start()
@@ -78,7 +80,7 @@ def broker_absent(rig: Rig) -> None:
 )
 def broker_hangs(rig: Rig) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        service = rig.start(_config(rig, server.getsockname()[1]))
+        service = rig.start(mqtt_config(rig, server.getsockname()[1]))
         service.settle()
         time.sleep(5)
         before, began_s = _rss_mb(service.process.pid), time.monotonic()
@@ -108,7 +110,7 @@ def unclean_disconnect(rig: Rig) -> None:
     proxy = HalfOpen(broker.port)
     rig.callback(proxy.close)
     listener = Listener(rig, broker.port)
-    service = rig.start(_config(rig, proxy.port, f"  keepalive_s: {keepalive_s}\n"))
+    service = rig.start(mqtt_config(rig, proxy.port, f"  keepalive_s: {keepalive_s}\n"))
     service.settle()
     listener.until("/availability", b"online", 0.0, 10)
     proxy.hold()
@@ -156,9 +158,9 @@ class HalfOpen:
 
 @row(
     35,
-    "another CA, an expired certificate, plaintext at a TLS port",
+    "another CA, an expired certificate, plaintext at a TLS port, access rules that forbid",
     "refused, no plaintext fallback",
-    "bytes published = 0; reported = 3 cases",
+    "bytes published = 0; reported = 4 cases",
 )
 def wrong_certificates(rig: Rig) -> None:
     folder, reported, published = rig.folder, 0, 0
@@ -179,7 +181,7 @@ def wrong_certificates(rig: Rig) -> None:
         )
         broker: Broker = rig.broker(*lines)
         port = broker.port
-        service = rig.start(_config(rig, port, f"  tls: true\n  ca_file: {folder}/{ca}.pem\n"))
+        service = rig.start(mqtt_config(rig, port, f"  tls: true\n  ca_file: {folder}/{ca}.pem\n"))
         service.settle()
         time.sleep(4)
         said = [line for line in service.lines if "mqtt" in line]
@@ -190,6 +192,17 @@ def wrong_certificates(rig: Rig) -> None:
         published += log.count("Received PUBLISH") + log.count(" as bikeped")
         service.close()
         broker.kill()
+    rules = folder / "rules.acl"
+    rules.write_text("topic read #\ntopic write elsewhere/#\n")
+    broker = rig.broker("allow_anonymous true", f"acl_file {rules}")
+    listener = Listener(rig, broker.port)
+    service = rig.start(mqtt_config(rig, broker.port, ""))
+    service.settle()
+    time.sleep(7)
+    said = any("access rules" in line for line in service.lines)
+    rig.expect(said, "access rules that forbid: not named in the log")
+    reported += said
+    published += len(listener.received)
     rig.measure("bytes published", published)
     rig.measure("reported", reported)
 
@@ -209,7 +222,7 @@ def _openssl(*arguments: object) -> None:
 )
 def forged(rig: Rig) -> None:
     broker = rig.broker()
-    service = rig.start(_config(rig, broker.port, "  site: pole\n"))
+    service = rig.start(mqtt_config(rig, broker.port, "  site: pole\n"))
     service.settle()
     listener = Listener(rig, broker.port)
     listener.until("/availability", b"online", 0.0, 10)

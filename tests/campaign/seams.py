@@ -6,6 +6,7 @@ Each is switched by the campaign through the text of the file CAMPAIGN_CONTROL, 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import signal
 import threading
@@ -16,9 +17,11 @@ import numpy as np
 
 from bikeped.capture.cameras import NetworkSource
 from bikeped.detection.detector import DetectionResult, Detector
+from bikeped.detection.output_layouts import Candidates
+from bikeped.detection.preprocess import Letterbox
 from bikeped.errors import DetectorError, FeedbackError
 from bikeped.feedback.light import SimulatedLight
-from bikeped.types import Colour, Detections, Frame, ImageArray
+from bikeped.types import Colour, Detections, Frame, ImageArray, Kind
 
 
 def control() -> tuple[str, float]:
@@ -54,8 +57,19 @@ def camera() -> None:
 
 
 def detector() -> None:
-    """The detector: `raise`, `memory`, `stall` for seconds, `empty` answers, `crowd` of so many."""
+    """The detector: `raise`, `memory`, `stall` for seconds, `empty` answers, and the network's raw
+    output: a `crowd` of so many candidates, before suppression and every cap."""
     infer, began = Detector.infer, list[float]()
+    road_users = Detector._road_users
+
+    def crowded(self: Detector, candidates: Candidates, letterbox: Letterbox) -> Detections:
+        word, number = control()
+        if word == "crowd":
+            found = crowd(int(number), *self.input_size)
+            class_of = {k: np.flatnonzero(self._kind_of_class == k)[0] for k in (0, 1)}
+            class_id = np.where(found.kind == Kind.CYCLIST, class_of[1], class_of[0])
+            candidates = Candidates(found.box_px, found.confidence, class_id)
+        return road_users(self, candidates, letterbox)
 
     def faulty(self: Detector, rgb: ImageArray, width: int, height: int) -> DetectionResult:
         word, number = control()
@@ -72,11 +86,10 @@ def detector() -> None:
         result = infer(self, rgb, width, height)
         if word == "empty":
             return dataclasses.replace(result, detections=Detections.empty())
-        if word == "crowd":
-            return dataclasses.replace(result, detections=crowd(int(number), width, height))
         return result
 
     Detector.infer = faulty  # type: ignore[method-assign]
+    Detector._road_users = crowded  # type: ignore[method-assign]
 
 
 def wall_clock() -> None:
@@ -113,6 +126,7 @@ def interpreter() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+@functools.cache
 def crowd(number: int, width: int, height: int) -> Detections:
     """So many people and cyclists, spread over the ground in the picture."""
     rng = np.random.default_rng(number)

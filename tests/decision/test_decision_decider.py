@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from bikeped.decision.decider import Decider
 from bikeped.decision.rules import RuleSettings, evaluate_rule, is_remembered, resolve_state
 from bikeped.decision.shown import AS_RAW
-from bikeped.decision.track_rows import TrackRows
-from bikeped.decision.who_counts import counted_pairs
+from bikeped.decision.track_rows import TrackRows, pair_rows
 from bikeped.types import State
 
 PEDESTRIAN, CYCLIST = 0, 1
@@ -313,7 +312,7 @@ def rows_of(frames):
 
 def states_at_once(rule, frames):
     rows, count = rows_of(frames), len(frames)
-    pairs = counted_pairs(rows, count_all=True)
+    pairs = pair_rows(rows)
     fires = evaluate_rule(rows, pairs, rule).fires
     times = np.array([t for t, _ in frames])
     cyclist = np.bincount(rows.frame[rows.kind == CYCLIST], minlength=count) > 0
@@ -337,7 +336,7 @@ def test_frame_by_frame_equals_all_at_once_equals_the_plain_writing(rule, frames
 @given(rules, sequences())
 def test_the_numbers_are_the_same_too(rule, frames):
     rows = rows_of(frames)
-    pairs = counted_pairs(rows, count_all=True)
+    pairs = pair_rows(rows)
     verdicts = evaluate_rule(rows, pairs, rule)
     frame = rows.frame[pairs.pedestrian_row]
     for f, decision in enumerate(run(rule, frames)):

@@ -280,7 +280,7 @@ def test_the_unit_starts_watches_and_darkens() -> None:
     ]
     assert unit_values("Type") == ["notify"]
     assert unit_values("NotifyAccess") == ["main"]
-    assert unit_values("WatchdogSec") == ["10"]
+    assert unit_values("WatchdogSec") == ["4"]
     assert unit_values("Restart") == ["always"]
     assert unit_values("StartLimitIntervalSec") == ["0"]
     assert unit_values("User") == ["bikeped"]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 
 import numpy as np
+import onnx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -160,5 +162,35 @@ def test_the_hash_is_checked(tmp_path):
         assert part in str(caught.value)
     with pytest.raises(DetectorError, match="no such model file"):
         sha256_of(tmp_path / "none.onnx")
+    (tmp_path / "empty.onnx").touch()
+    with pytest.raises(DetectorError, match="is empty"):
+        sha256_of(tmp_path / "empty.onnx")
     with pytest.raises(DetectorError, match="cannot read"):
         sha256_of(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["weights.bin", "w" * 200 + ".data"])
+def test_the_hash_covers_weights_in_files_of_their_own(tmp_path, name):
+    weights = np.arange(64, dtype=np.float32)
+    tensor = onnx.numpy_helper.from_array(weights, "w")
+    node = onnx.helper.make_node("Add", ["x", "w"], ["y"])
+    ports = [
+        onnx.helper.make_tensor_value_info(port, onnx.TensorProto.FLOAT, [64]) for port in "xy"
+    ]
+    graph = onnx.helper.make_graph([node], "g", ports[:1], ports[1:], [tensor])
+    path = tmp_path / "m.onnx"
+    onnx.save(
+        onnx.helper.make_model(graph),
+        path,
+        save_as_external_data=True,
+        location=name,
+        size_threshold=0,
+    )
+    beside = tmp_path / name
+    both = hashlib.sha256(path.read_bytes() + beside.read_bytes()).hexdigest()
+    assert sha256_of(path) == both
+    beside.write_bytes(beside.read_bytes()[:-1] + b"\1")
+    assert sha256_of(path) != both
+    beside.unlink()
+    with pytest.raises(DetectorError, match="no such model file"):
+        sha256_of(path)

@@ -243,15 +243,17 @@ assert log.dropped == 0
     )
 
 
-def test_a_line_that_a_power_cut_tore_does_not_spoil_the_next(tmp_path: Path):
+@pytest.mark.parametrize("tail", ['{"t":1.0,"fra', '{"t":1.0,' + 2084 * "\0", "\0" * 9000])
+@pytest.mark.parametrize("whole", [[], [3]])
+def test_a_power_cut_costs_only_what_follows_the_last_whole_line(tmp_path, whole, tail, caplog):
     path = tmp_path / "audit.jsonl"
-    path.write_bytes(b'{"t":1.0,"fra')
+    path.write_text("".join(f'{{"frame":{n}}}\n' for n in whole) + tail)
     log = audit(path)
     log.write(line(5))
     assert log.close(DEADLINE_S)
-    torn, *rest = path.read_text().splitlines()
-    assert torn == '{"t":1.0,"fra'
-    assert [json.loads(text).get("frame") for text in rest] == [None, 5]
+    rest = path.read_text().splitlines()
+    assert [json.loads(text).get("frame") for text in rest] == [*whole, None, 5]
+    assert "cut 13 bytes of a torn last line" in caplog.text or "\0" in tail
 
 
 def test_a_file_that_was_moved_away_is_begun_anew(tmp_path: Path):

@@ -99,6 +99,7 @@ HEALTH = wire.HealthMessage(
     faults=["camera: no frame for 2 s"],
     fault_codes=["camera.no_frame"],
     counters=COUNTERS,
+    instance="3f9a1c0b",
 )
 STATE = wire.StateMessage(
     state="ALERT",

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from bikeped import __version__
-from bikeped.config.edit import replace_section
+from bikeped.config.edit import completed, replace_section, set_values
 from bikeped.config.load import LoadedConfig, config_hash, parse_config
 from bikeped.config.provenance import (
     DECIDING_CODE,
@@ -34,6 +34,7 @@ from bikeped.files import write_like
 from bikeped.lab.simulation.metrics import Metrics, finite_or_none
 from bikeped.lab.simulation.suite import Suite, camera_json
 from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S
+from bikeped.models import BUNDLED, model_file, model_sha256
 
 SENSITIVITY_MIN = 0.90
 SPECIFICITY_MIN = 0.90
@@ -172,8 +173,16 @@ def promote(
     before = read_text(target, "give it with -c")
     note = f"promoted {record['promoted_at'][:10]}, see {provenance_path(target).name}"
     values = msgspec.to_builtins(decision)
-    after = replace_section(before, "decision", values, str(config_path), note)
-    wanted = msgspec.structs.replace(loaded.config, decision=decision)
+    after = completed(replace_section(before, "decision", values, str(config_path), note))
+    wanted = msgspec.structs.replace(loaded.config, decision=decision, complete=True)
+    detection = loaded.config.detection
+    model = None if detection.model is None else model_file(detection.model, loaded.base_dir)
+    # The bundled one is always checked; one that is not on this machine cannot be pinned here.
+    if detection.model != BUNDLED and detection.sha256 is None and model and model.is_file():
+        pinned = {"sha256": model_sha256(model)}
+        after = set_values(after, {"detection": pinned}, str(config_path))
+        detection = msgspec.structs.replace(detection, **pinned)
+        wanted = msgspec.structs.replace(wanted, detection=detection)
     if parse_config(after, str(config_path), config_path.parent).config != wanted:
         raise ConfigError(
             f"{config_path}: the file changed while the gates were checked, so nothing was "

@@ -19,8 +19,8 @@ from bikeped.decision.rules import (
     is_remembered,
     resolve_state,
 )
-from bikeped.decision.track_rows import Pairs, TrackRows
-from bikeped.decision.who_counts import counted_pairs, counts
+from bikeped.decision.track_rows import Pairs, TrackRows, pair_rows
+from bikeped.decision.who_counts import counts
 from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 from bikeped.tracking.tracker import predict
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
@@ -204,7 +204,7 @@ def build_rule_input(
         np.maximum.accumulate(part, out=part)
     return RuleInput(
         rows=rows,
-        pairs=counted_pairs(rows, count_all=settings.count_all),
+        pairs=pair_rows(rows),
         start=start,
         frames=history.frames,
         time_s=time_s,

@@ -84,7 +84,7 @@ def test_promotion_replaces_the_section_and_keeps_everything_else(place):
     text = (place / "config.yaml").read_text()
     head, tail = CONFIG.split("decision:")[0], CONFIG[CONFIG.index("\n# A remark on the light") :]
     assert text.startswith(head)
-    assert text.endswith(tail)
+    assert text.endswith(tail + "complete: true\n")
     assert "hand-made" not in text
     assert "a remark of the section" not in text
     assert (place / "config.yaml.bak").read_text() == CONFIG
