@@ -30,6 +30,10 @@ _GOVERNANCE = "bikeped.lab.cli.conformance_governance"
         "promote": (f"{_GOVERNANCE}:promote", "Write a candidate that holds all gates into -c."),
         "contest": (f"{_GOVERNANCE}:contest", "What-if comparison: results before and after."),
         "register": (f"{_GOVERNANCE}:register", "Write the residual-risk register."),
+        "encounters": (
+            "bikeped.lab.cli.conformance_traffic:encounters",
+            "Write random encounters as scenario files.",
+        ),
         "plot": (f"{_GOVERNANCE}:plot", "Draw each scenario over time and from above."),
         "pixels": (
             "bikeped.lab.cli.conformance_pixels",

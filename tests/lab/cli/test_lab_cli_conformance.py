@@ -297,7 +297,7 @@ def test_group_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     said = capsys.readouterr().out
     experiments = ["run", "compare", "montecarlo", "latency", "truth", "optimize", "deployment"]
     experiments += ["placement", "errors", "reproduce"]
-    for name in [*experiments, "gate", "promote", "contest", "register", "plot"]:
+    for name in [*experiments, "gate", "promote", "contest", "register", "plot", "encounters"]:
         assert f"  {name} " in said
 
 
