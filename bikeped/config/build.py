@@ -18,6 +18,7 @@ from bikeped.geometry.framing import Framing
 from bikeped.geometry.framing import road_region as region_of
 from bikeped.geometry.lens import Lens, canonical_projection
 from bikeped.tracking.batch_tracker import TrackerSettings
+from bikeped.tracking.kalman import MotionNoise
 from bikeped.types import Region
 
 
@@ -67,8 +68,7 @@ def tracker_settings(
     return TrackerSettings(
         match_radius_m=tracking.match_radius_m,
         max_unseen_s=tracking.max_unseen_s,
-        velocity_weight=tracking.velocity_weight,
-        position_weight=tracking.position_weight,
+        motion=motion_noise(tracking),
         frame_s=1 / nominal_fps,
         confirm_hits=tracking.confirm_hits,
         max_speed_mps=(
@@ -77,12 +77,24 @@ def tracker_settings(
             tracking.max_speed_vehicle_mps,
         ),
         position_noise_m=tracking.position_noise_m,
-        unbiased=True,
         acceleration=acceleration,
         max_range_m=tracking.max_range_m,
         rider_radius_m=tracking.rider_radius_m,
         cyclist_box_includes_rider=cyclist_box_includes_rider,
         max_tracks=MAX_TRACKS,
+    )
+
+
+def motion_noise(tracking: TrackingConfig) -> MotionNoise:
+    """The tracker's filter; vehicles, on which nothing is decided, move as cyclists."""
+
+    def by_kind(pedestrian: float, cyclist: float) -> tuple[float, float, float]:
+        return pedestrian, cyclist, cyclist
+
+    return MotionNoise(
+        by_kind(tracking.measurement_noise_pedestrian_m, tracking.measurement_noise_cyclist_m),
+        by_kind(tracking.acceleration_pedestrian_mps2, tracking.acceleration_cyclist_mps2),
+        by_kind(tracking.first_speed_pedestrian_mps, tracking.first_speed_cyclist_mps),
     )
 
 

@@ -166,13 +166,22 @@ class TrackingConfig(Section, frozen=True):
     """largest distance between a detection and the track that it is matched with, m"""
     max_unseen_s: Annotated[float, Meta(ge=0, le=30)] = 10.0
     """an unseen track coasts at constant velocity this long, s"""
-    velocity_weight: Annotated[float, Meta(gt=0, le=1)] = 0.15
-    """weight of the newest step in the smoothed velocity, per nominal frame; the paper's simulation
-    has 0.5, with which the noise of real boxes carries lost tracks far away"""
-    position_weight: Annotated[float, Meta(gt=0, le=1)] = 0.2
-    """weight of a detection against the predicted position of its track, per nominal frame; with 1,
-    as in the paper's simulation, a track jumps as its boxes do, which can hide that a pair closes
-    in"""
+    measurement_noise_pedestrian_m: Annotated[float, Meta(gt=0, le=5)] = 0.08
+    """standard deviation of a detection's place, on each axis: the jitter of real boxes at 10 m is
+    0.05 to 0.15; a larger one makes tracks calmer and later, m"""
+    measurement_noise_cyclist_m: Annotated[float, Meta(gt=0, le=5)] = 0.10
+    """the same of cyclists and vehicles, whose boxes are larger, m"""
+    acceleration_pedestrian_mps2: Annotated[float, Meta(gt=0, le=50)] = 3.0
+    """standard deviation of the acceleration, anew every nominal frame: after a second of it the
+    speed has changed by 0.55 m/s, as walkers' do, m/s^2"""
+    acceleration_cyclist_mps2: Annotated[float, Meta(gt=0, le=50)] = 6.0
+    """the same of cyclists and vehicles: 1.1 m/s after a second, a rider who brakes or turns,
+    m/s^2"""
+    first_speed_pedestrian_mps: Annotated[float, Meta(gt=0, le=50)] = 1.5
+    """standard deviation of the velocity of a new track: a walker's. Steps that need a higher speed
+    are believed only when several agree, m/s"""
+    first_speed_cyclist_mps: Annotated[float, Meta(gt=0, le=50)] = 5.0
+    """the same of cyclists and vehicles, m/s"""
     speed_window_frames: Annotated[int, Meta(ge=1, le=60)] = 4
     """speed and velocity are the displacement over these nominal frames: a cyclist's in the
     stopping distance, and the published one"""

@@ -15,7 +15,11 @@ from bikeped.config.strict_yaml import one_line
 from bikeped.errors import ConfigError
 
 #: Keys of older versions, and what stands for them now.
-_RENAMED = {"feedback.hold_alert_s": "decision.alert_hold_s"}
+_RENAMED = {
+    "feedback.hold_alert_s": "decision.alert_hold_s",
+    "tracking.position_weight": "tracking.measurement_noise_pedestrian_m, and _cyclist_m",
+    "tracking.velocity_weight": "tracking.acceleration_pedestrian_mps2, and _cyclist_mps2",
+}
 
 
 def to_config(data: dict[str, Any], source: str) -> Config:

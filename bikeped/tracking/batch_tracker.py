@@ -11,46 +11,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from bikeped.tracking.kalman import MotionNoise, correct
+from bikeped.tracking.matching import IndexArray, match_greedy
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
-
-IndexArray = npt.NDArray[np.intp]
-
-
-def match_greedy(
-    track: IndexArray, detection: IndexArray, cost: FloatArray, tracks: int, detections: int
-) -> IndexArray:
-    """Detection of each track [tracks], -1 for none: greedy, nearest first.
-
-    `track`, `detection`, `cost` [m] are the allowed pairs in ascending (track, detection) order,
-    with indices below `tracks` and `detections`. Each pair, by distance (ties: lower track, then
-    lower detection), is taken if both are free: not optimal (Hungarian), as in the paper, but a
-    resident can follow it on a plan. A pair that is the nearest of both is taken in that order in
-    any case, so all such pairs are taken at once, in a few rounds instead of a loop over pairs.
-    """
-    matched = np.full(tracks, -1, np.intp)
-    if len(cost) == 0:
-        return matched
-    order = cost.argsort(kind="stable")
-    track, detection = track[order], detection[order]
-    first_of_track = np.empty(tracks, np.intp)
-    first_of_detection = np.empty(detections, np.intp)
-    while len(track):
-        rank = np.arange(len(track))
-        # Written backwards, the first (nearest) pair of each is what stays.
-        first_of_track[track[::-1]] = rank[::-1]
-        first_of_detection[detection[::-1]] = rank[::-1]
-        mutual = (first_of_track[track] == rank) & (first_of_detection[detection] == rank)
-        matched[track[mutual]] = detection[mutual]
-        if np.count_nonzero(mutual) == len(mutual):
-            break
-        taken = np.zeros(detections, np.bool_)
-        taken[detection[mutual]] = True
-        rest = (matched[track] < 0) & ~taken[detection]
-        track, detection = track[rest], detection[rest]
-    return matched
-
 
 #: Slack of comparisons between times, far below a frame and far above rounding.
 _EPSILON_S = 1e-6
@@ -63,6 +27,8 @@ _CYCLE_WEIGHT = 0.08
 #: pedestrian again; where one box holds rider and cycle, the most frequent kind is the right one.
 _CYCLE_SHARES = (0.12, 0.03)
 _MAJORITY_SHARES = (0.55, 0.45)
+#: Weight of the newest step in the smoothed acceleration, per nominal frame.
+_ACCELERATION_WEIGHT = 0.15
 #: A cyclist's track unseen for longer is not continued by a detection of a person.
 _RIDER_MAX_UNSEEN_S = 1.0
 #: A cycle that stands (definitions, section 13): it moves no farther than this, for so long, and no
@@ -79,11 +45,10 @@ class TrackerSettings:
     The defaults are the tracker of the paper's simulation (definitions, section 7); the device's
     come from the configuration. A match is gated by `max_speed_mps` of its kind (pedestrian,
     cyclist, vehicle): a detection may lie at most speed * time since last seen +
-    `position_noise_m` from the track's last position. `velocity_weight` and `position_weight` are
-    the weights of the newest velocity and position per `frame_s` (an alpha-beta filter;
-    `position_weight` 1 puts tracks where their detections are). With `unbiased` the smoothed
-    velocity starts at the first step instead of at zero. A track that coasts farther than
-    `max_range_m` from the origin is dropped.
+    `position_noise_m` from the track's last position. `motion` gives the Kalman filter of the
+    device's; without it tracks are where their detections are, and their velocity is an exponential
+    mean with `velocity_weight` per `frame_s` for the newest step, from zero. A track that coasts
+    farther than `max_range_m` from the origin is dropped.
 
     `rider_radius_m`: detectors see a small bicycle in some frames and only its rider in others. A
     person without a track within this radius of an unmatched cyclist's track continues that track
@@ -96,13 +61,12 @@ class TrackerSettings:
 
     match_radius_m: float = 3.0
     max_unseen_s: float = 30 / 30
+    motion: MotionNoise | None = None
     velocity_weight: float = 0.5
-    position_weight: float = 1.0
     frame_s: float = 1 / 30
     confirm_hits: int = 1
     max_speed_mps: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     position_noise_m: float = math.inf
-    unbiased: bool = False
     max_range_m: float = math.inf
     rider_radius_m: float = 0.0
     cyclist_box_includes_rider: bool = False
@@ -116,7 +80,8 @@ class BatchTracker:
     Arrays are [batch, slots]; positions (m), velocities and accelerations [batch, slots, 2]. Values
     in slots with `alive` false are undefined. `id` counts up from 1 in each scene in order of
     birth; `detection` is the index matched in the last update, or -1; `parked` marks cycles that
-    stand without a person, until they move.
+    stand without a person, until they move. `covariance` [batch, slots, 3] is that of `kalman`, at
+    the time `seen_s`.
     """
 
     def __init__(self, settings: TrackerSettings, scenes: int = 1, slots: int = 8) -> None:
@@ -128,6 +93,7 @@ class BatchTracker:
         self.xy_m: FloatArray = np.zeros((scenes, slots, 2))
         self.velocity_mps: FloatArray = np.zeros((scenes, slots, 2))
         self.acceleration_mps2: FloatArray = np.zeros((scenes, slots, 2))
+        self.covariance: FloatArray = np.zeros((scenes, slots, 3))
         self.seen_s: FloatArray = np.zeros((scenes, slots))
         self.hits: IntArray = np.zeros((scenes, slots), np.int64)
         self.detection: IndexArray = np.full((scenes, slots), -1, np.intp)
@@ -140,6 +106,9 @@ class BatchTracker:
         self._next_id: IntArray = np.ones(scenes, np.int64)
         self._max_speed = np.asarray(settings.max_speed_mps)
         self._gated = bool(np.isfinite(self._max_speed).any())
+        motion = settings.motion or MotionNoise()
+        # A pair, for `_grow` widens every array.
+        self._motion = motion.noise(settings.frame_s), motion.first_covariance()
 
     @property
     def reported(self) -> BoolArray:
@@ -261,26 +230,29 @@ class BatchTracker:
         scene = flat // matched.shape[1]
         velocity = self.velocity_mps.reshape(-1, 2)
         acceleration = self.acceleration_mps2.reshape(-1, 2)
+        covariance = self.covariance.reshape(-1, 3)
         seen_xy = self._seen_xy_m.reshape(-1, 2)
         seen_s, hits = self.seen_s.reshape(-1), self.hits.reshape(-1)
         place = scene * xy_m.shape[1] + matched.ravel()[flat]
         new_xy = xy_m.reshape(-1, 2)[place]
         elapsed = np.maximum(time_s - seen_s[flat], _EPSILON_S)
-        keep = (1 - self.settings.velocity_weight) ** (elapsed / self.settings.frame_s)
         old_v = velocity[flat]
-        if self.settings.position_weight < 1:
-            keep_xy = (1 - self.settings.position_weight) ** (elapsed / self.settings.frame_s)
-            # A young track's velocity comes from a few noisy steps: at first the weights are those
-            # with which the filter fits a line to all of its detections.
-            n = hits[flat] + 1
-            keep_xy = np.minimum(keep_xy, 1 - 2 * (2 * n - 1) / (n * (n + 1)))[:, None]
-            keep = np.minimum(keep, 1 - 3 / (2 * n - 1))
-            new_xy = new_xy + keep_xy * (self.xy_m.reshape(-1, 2)[flat] - new_xy)
-        raw_v = (new_xy - seen_xy[flat]) / elapsed[:, None]
-        if self.settings.unbiased:
-            keep = np.where(hits[flat] == 1, 0.0, keep)
-        kept = keep[:, None]
-        new_v = old_v * kept + raw_v * (1 - kept)
+        if self.settings.motion is None:
+            weight = self.settings.velocity_weight
+        else:
+            weight = _ACCELERATION_WEIGHT
+        kept = ((1 - weight) ** (elapsed / self.settings.frame_s))[:, None]
+        if self.settings.motion is None:
+            new_v = old_v * kept + (new_xy - seen_xy[flat]) / elapsed[:, None] * (1 - kept)
+        else:
+            new_xy, new_v, covariance[flat] = correct(
+                self.xy_m.reshape(-1, 2)[flat],
+                old_v,
+                covariance[flat],
+                new_xy,
+                elapsed,
+                self._motion[0][self.kind.ravel()[flat]],
+            )
         if self._gated:
             limit = self._max_speed[self.kind.ravel()[flat]]
             over = (new_v * new_v).sum(1) > limit * limit
@@ -383,6 +355,7 @@ class BatchTracker:
         self.parked[at] = False
         self.velocity_mps[at] = 0.0
         self.acceleration_mps2[at] = 0.0
+        self.covariance[at] = self._motion[1][kind[scene, detection]]
         self.seen_s[at] = time_s
         self.hits[at] = 1
         self._cycle_share[at] = kind[scene, detection] == _CYCLIST

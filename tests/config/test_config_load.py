@@ -235,6 +235,10 @@ def test_files_that_cannot_be_read(tmp_path):
             "feedback: {sound: {volum: 1}}\n",
             "feedback.sound.volum: unknown key; did you mean volume",
         ),
+        (
+            "tracking: {position_weight: 0.2}\n",
+            "tracking.position_weight: is now tracking.measurement_noise_pedestrian_m, and",
+        ),
         ("web: {qqq: 1}\n", "web.qqq: unknown key; known here: enabled, host, port"),
         ('web: {"a\\nb": 1}\n', "web.a b: unknown key"),
     ],

@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings, match_greedy
+from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
+from bikeped.tracking.kalman import MotionNoise
+from bikeped.tracking.matching import match_greedy
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=150)
 
@@ -63,7 +65,7 @@ GATED = TrackerSettings(
     max_speed_mps=(6.0, 20.0, 40.0),
     position_noise_m=1.6,
     confirm_hits=2,
-    unbiased=True,
+    motion=MotionNoise(),
 )
 
 

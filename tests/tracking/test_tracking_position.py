@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
+from bikeped.tracking.kalman import MotionNoise
 
-RAW = TrackerSettings(velocity_weight=0.2, unbiased=True, max_unseen_s=10.0)
-CALM = replace(RAW, position_weight=0.5)
+#: A track is where its detection is, or where the filter puts it.
+RAW = TrackerSettings(max_unseen_s=10.0)
+CALM = TrackerSettings(max_unseen_s=10.0, motion=MotionNoise())
 
 
 def follow(settings: TrackerSettings, seen: np.ndarray, frames: list[int] | None = None):
@@ -30,43 +30,39 @@ def walk(count: int, velocity: tuple[float, float] = (1.4, -0.3)) -> np.ndarray:
     return np.array([4.0, 9.0]) + np.arange(count)[:, None] / 30 * np.array(velocity)
 
 
-def test_a_weight_of_one_puts_the_track_where_its_detection_is():
-    seen = walk(20) + np.random.default_rng(1).normal(0, 0.2, (20, 2))
-    assert np.array_equal(follow(RAW, seen), seen)
+@given(st.floats(-9, 9), st.floats(-9, 9))
+def test_who_moves_evenly_is_soon_followed_without_lag(east, north):
+    path = walk(60, (east, north))
+    assert follow(CALM, path)[45:] == pytest.approx(path[45:], abs=0.005)
 
 
-@given(st.floats(-9, 9), st.floats(-9, 9), st.floats(0.05, 1))
-def test_who_moves_evenly_is_followed_without_lag(east, north, weight):
-    path = walk(30, (east, north))
-    assert follow(replace(CALM, position_weight=weight), path) == pytest.approx(path, abs=1e-9)
-
-
-def test_noise_is_halved_and_closing_in_shows_over_two_frames():
-    noise = np.random.default_rng(2).normal(0, 0.15, (600, 2))
+@pytest.mark.parametrize("noise_m", [0.05, 0.1, 0.15])
+def test_noise_is_halved_and_closing_in_shows_over_two_frames(noise_m):
+    noise = np.random.default_rng(2).normal(0, noise_m, (600, 2))
     path = walk(600)
     raw, calm = follow(RAW, path + noise), follow(CALM, path + noise)
     late = slice(30, None)
     error = [np.sqrt(((p - path)[late] ** 2).sum(1).mean()) for p in (raw, calm)]
-    assert error[1] < 0.75 * error[0]
+    assert error[1] < 0.55 * error[0]
     # What the decision asks: is it farther along than two frames ago?
     forward = [np.mean(p[32:, 0] > p[30:-2, 0]) for p in (raw, calm)]
-    assert forward[1] > forward[0] + 0.1
+    assert 1 - forward[1] < 0.5 * (1 - forward[0])
 
 
 def test_who_stops_at_once_is_overshot_by_little():
     path = np.concatenate([walk(60, (5.0, 0.0)), np.repeat(walk(60, (5.0, 0.0))[-1:], 60, 0)])
     calm = follow(CALM, path)
-    assert np.abs(calm - path).max() < 0.35
+    assert np.abs(calm - path).max() < 0.45
     assert np.abs(calm - path)[-20:].max() < 0.05
 
 
 def test_after_a_gap_the_detection_counts_for_more():
-    frames = [*range(30), 45]
-    seen = np.concatenate([walk(30), walk(46)[45:] + np.array([0.8, 0.0])])
+    frames = [*range(30), 90]
+    seen = np.concatenate([walk(30), walk(91)[90:] + np.array([0.8, 0.0])])
     calm = follow(CALM, seen, frames)
-    assert calm[-1] == pytest.approx(seen[-1], abs=1e-3)
+    assert calm[-1] == pytest.approx(seen[-1], abs=0.01)
     near = follow(CALM, np.concatenate([walk(30), walk(31)[30:] + np.array([0.8, 0.0])]))
-    assert near[-1, 0] - walk(31)[30, 0] == pytest.approx(0.4, abs=1e-6)
+    assert near[-1, 0] - walk(31)[30, 0] < 0.3
 
 
 def test_a_young_track_is_calmer_than_its_sights_and_does_not_seem_to_walk():
@@ -79,13 +75,7 @@ def test_a_young_track_is_calmer_than_its_sights_and_does_not_seem_to_walk():
             error[settings].append((found**2).sum(1))
             moved[settings].append(np.hypot(*(found[2:] - found[:-2]).T) > 0.15)
     noise = [np.sqrt(np.mean(error[settings], axis=0)) for settings in (RAW, CALM)]
-    assert (noise[1][2:] < noise[0][2:]).all()
-    assert noise[1][-1] < 0.7 * noise[0][-1]
+    assert (noise[1][2:] < 0.8 * noise[0][2:]).all()
+    assert noise[1][-1] < 0.6 * noise[0][-1]
     walks = [np.mean(moved[settings], axis=0) for settings in (RAW, CALM)]
-    assert walks[1][0] < walks[0][0] + 0.06  # of three sights, nobody can say much
-    assert (walks[1][1:] < 0.5 * walks[0][1:]).all()
-
-
-def test_a_young_track_is_where_it_was_seen():
-    seen = walk(2, (6.0, 0.0))
-    assert np.array_equal(follow(CALM, seen), seen)
+    assert (walks[1] < 0.5 * walks[0]).all()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
+from bikeped.tracking.kalman import MotionNoise
 from bikeped.types import Kind
 
 P, C, V = int(Kind.PEDESTRIAN), int(Kind.CYCLIST), int(Kind.VEHICLE)
@@ -16,7 +17,7 @@ SETTINGS = TrackerSettings(
     confirm_hits=2,
     max_speed_mps=(6.0, 20.0, 40.0),
     position_noise_m=0.75,
-    unbiased=True,
+    motion=MotionNoise(),
     rider_radius_m=1.0,
 )
 #: Of a detector that boxes rider and cycle as one.

@@ -114,7 +114,10 @@ def test_provenance_names_what_the_promotion_rests_on(place):
         (("  height_m: 3.6576", "  height_m: 4.2"), "the camera or its calibration"),
         (("  height_m: 3.6576", "  height_m: 3.6576\n  crop_size: 3499"), "the camera or"),
         (("  height_m: 3.6576", "  height_m: 3.6576\n  table_step_px: 9"), "the camera or"),
-        (("feedback:", "tracking:\n  velocity_weight: 0.5\nfeedback:"), "the tracking section"),
+        (
+            ("feedback:", "tracking:\n  acceleration_cyclist_mps2: 5.0\nfeedback:"),
+            "the tracking section",
+        ),
         (("feedback:", "latency:\n  compensation: measured\nfeedback:"), "the latency section"),
         (("feedback:", "detection:\n  cyclist: [rider]\nfeedback:"), "the detector"),
         (("feedback:", "detection:\n  model: bundled\nfeedback:"), "the detector"),
