@@ -2,9 +2,10 @@
 
 `LightDriver` runs one thread. The thread blinks the light, it alone calls the device (a device that
 hangs blocks nothing else), and it is a watchdog: without a call of `show` for `watchdog_s` it shows
-FAULT. A thread and not an asyncio task, because it must work when the event loop is stuck. It does
-not cover a process that died or whose interpreter is stuck: systemd's watchdog ends that process,
-and `python -m bikeped.feedback` (ExecStopPost) then darkens the light.
+FAULT. Where the device reads back another colour than the one that was set, it latches FAULT until
+the next start. A thread and not an asyncio task, because it must work when the event loop is stuck.
+It does not cover a process that died or whose interpreter is stuck: systemd's watchdog ends that
+process, and `python -m bikeped.feedback` (ExecStopPost) then darkens the light.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from bikeped.errors import FeedbackError
 from bikeped.faults import Fault
 from bikeped.feedback.signal_logic import fault_signal
 from bikeped.lamp.colours import Colour, Light, blinked
+from bikeped.lamp.logic import ReadbackLatch
 from bikeped.types import Signal
 
 _log = logging.getLogger(__name__)
@@ -70,7 +72,8 @@ class LightDriver:
     """
 
     hang_s = 2.0  #: a device call longer than this is a fault
-    assert_s = 2.0  #: between two sendings of an unchanged colour: a replugged light is noticed
+    assert_s = 0.5  #: between two sendings of an unchanged colour: a replugged light is noticed
+    read_s = 0.1  #: between two readings of what is lit, where the device can tell
     retry_s = (0.5, 4.0)  #: first and longest pause after an error; pauses double
 
     def __init__(
@@ -104,6 +107,7 @@ class LightDriver:
         self._pattern_s = 0.0
         self._retry_at_s: float | None = None
         self._pause_s = self.retry_s[0]
+        self._readback = ReadbackLatch()
         self._tripped = False
         self._to_say = (False, False)  # whether the watchdog has tripped, and had before
         self._thread: threading.Thread | None = None
@@ -136,6 +140,9 @@ class LightDriver:
             if self._busy_since is not None and self._clock() - self._busy_since > self.hang_s:
                 detail = f"the device has not answered for more than {self.hang_s:g} s"
                 return Fault("light", "light.hang", detail)
+            if self._readback.latched:
+                detail = f"{self._readback.latched}; repair it, then restart the service"
+                return Fault("lamp", "lamp.latched", detail)
             return self._error
 
     def close(self, timeout_s: float = 2.0) -> bool:
@@ -177,7 +184,7 @@ class LightDriver:
             stale = now_s - shown_s >= self._watchdog_s
             was, self._tripped = self._tripped, stale and signal is not None
         self._to_say = (self._tripped, was)
-        if stale or signal is None:
+        if stale or signal is None or (self._readback.latched and signal.colour is not Colour.OFF):
             return self._watchdog_signal, float("inf")
         return signal, shown_s + self._watchdog_s
 
@@ -185,9 +192,14 @@ class LightDriver:
         """Makes the device show `colour`, if it does not already; returns when to check again."""
         if self._retry_at_s is not None and now_s < self._retry_at_s:
             return self._retry_at_s
-        if colour == self._applied and 0 <= now_s - self._applied_s < self.assert_s:
-            return self._applied_s + self.assert_s
+        reads = getattr(self._light, "mismatch", None)
+        pause_s = self.assert_s if reads is None else self.read_s
         try:
+            if reads is not None and self._applied is not None:
+                applied = self._applied
+                self._readback.update(self._call(lambda: reads(applied)), now_s)
+            if colour == self._applied and 0 <= now_s - self._applied_s < self.assert_s:
+                return min(self._applied_s + self.assert_s, now_s + pause_s)
             if self._light is None:
                 self._light = self._call(self._open_light)
             light = self._light
@@ -203,7 +215,7 @@ class LightDriver:
             with self._changed:
                 self._error = None
         self._applied, self._applied_s = colour, now_s
-        return now_s + self.assert_s
+        return now_s + pause_s
 
     def _call(self, action: Callable[[], _T]) -> _T:
         with self._changed:

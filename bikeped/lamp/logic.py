@@ -75,6 +75,27 @@ def hold_s(silences: int) -> float:
 
 
 @dataclass
+class ReadbackLatch:
+    """Latches what the lamps read back in place of the colour that was set, once it lasts."""
+
+    latched: str | None = None
+    _since_s: float | None = None
+
+    def update(self, mismatch: str | None, now_s: float) -> None:
+        """What is lit instead at `now_s`; None: the lamps agree."""
+        if mismatch is None:
+            self._since_s = None
+        elif self._since_s is None:
+            self._since_s = now_s
+        elif now_s - self._since_s > CONFLICT_S:
+            self.latched = self.latched or f"conflict: {mismatch}"
+
+    def reset(self) -> None:
+        """Begins anew."""
+        self.latched = self._since_s = None
+
+
+@dataclass
 class LampLogic:
     """The state of one lamp since power-on."""
 
@@ -85,7 +106,7 @@ class LampLogic:
     _since_s: float = -math.inf  # begin of the unbroken run of heartbeats
     _gaps: deque[float] = field(default_factory=lambda: deque(maxlen=FLICKERS))
     _silences: deque[float] = field(default_factory=lambda: deque(maxlen=4))
-    _conflict_s: float | None = None
+    _conflict: ReadbackLatch = field(default_factory=ReadbackLatch)
     _pattern: tuple[Colour, float] = FAULT
     _pattern_s: float = 0.0
 
@@ -114,16 +135,13 @@ class LampLogic:
 
     def readback(self, mismatch: str | None, now_s: float) -> None:
         """What the lamps read back in place of the colour that was set; None: they agree."""
-        if mismatch is None:
-            self._conflict_s = None
-        elif self._conflict_s is None:
-            self._conflict_s = now_s
-        elif now_s - self._conflict_s > CONFLICT_S:
-            self.latched = self.latched or f"conflict: {mismatch}"
+        self._conflict.update(mismatch, now_s)
+        self.latched = self.latched or self._conflict.latched
 
     def reset(self) -> None:
         """Ends what is latched; the heartbeats must prove themselves anew."""
-        self.latched = self._conflict_s = self._beat = None
+        self.latched = self._beat = None
+        self._conflict.reset()
         self._gaps.clear()
         self._silences.clear()
 

@@ -101,10 +101,10 @@ class Sharpness:
             usual_part - 1.0
         )
         left = energy[0] / np.maximum(usual_fine, 1e-6)
-        left = left / min(1.0, max(float(np.median(left[judged])), 1e-6))
-        lost = judged & blurred & (left < _PART_LEFT)
         # Where the camera sways, some parts gain the edges that others lose.
         gained = judged & (left > 1.0 / _PART_LEFT)
+        left = left / min(1.0, max(float(np.median(left[judged])), 1e-6))
+        lost = judged & blurred & (left < _PART_LEFT)
         share = (float(lost.sum()) - float(gained.sum())) / float(judged.sum())
         return max(share, 0.0), lost
 

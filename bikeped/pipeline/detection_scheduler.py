@@ -35,6 +35,8 @@ MAX_INFLIGHT = 2
 _CHECK_WAITS_S, _CHECK_DELAYS_S = 5.0, 0.12
 #: Decoded frames in use at once: being decoded, waiting, processed, drawn, a spare, and detected.
 FRAME_BUFFERS = 5 + MAX_INFLIGHT
+#: A picture narrower than this hides that it is blurred.
+MONITOR_WIDTH = 320
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,8 @@ class DetectorPool:
 class DetectionStage:
     """Decodes at the smallest scale that the detector needs, checks the picture, and detects.
 
-    `view_width`: pixels that a picture for people needs. `decode` belongs to one thread, `detect`
-    to one or more others.
+    `view_width`: pixels that a picture for people needs; the monitor needs `MONITOR_WIDTH`.
+    `decode` belongs to one thread, `detect` to one or more others.
     """
 
     def __init__(
@@ -111,7 +113,8 @@ class DetectionStage:
         self.detect = detector.detect
         self.max_inflight = detector.max_inflight if isinstance(detector, DetectorPool) else 1
         self._decode_size = detector.decode_size
-        self._view_width, self.picture_monitor = view_width, picture_monitor
+        self.picture_monitor = picture_monitor
+        self._view_width = view_width if picture_monitor is None else max(view_width, MONITOR_WIDTH)
         self._jpeg = JpegDecoder(buffers=FRAME_BUFFERS)
 
     def decode(self, frame: Frame, received_s: float, acquire_ms: float) -> DecodedFrame:

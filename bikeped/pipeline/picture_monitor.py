@@ -58,10 +58,12 @@ class PictureMonitor:
         """The checks of a picture [h, w, 3] captured at `time_s`; an error in them is a fault."""
         try:
             verdicts = self._health.update(rgb, time_s)
-            # A picture that cannot be trusted says nothing of the camera's place.
+            # A picture that cannot be trusted says nothing of the camera's place. One that has other
+            # contents, or drops on it, may be a camera that was knocked.
             trusted = not any(
                 (v.active or v.beyond) and FAULT_KINDS[v.code].effect is not Effect.NOTICE
                 for v in verdicts
+                if v.code not in ("picture.covered", "picture.spray")
             )
             if trusted and time_s >= self._drift_s + DRIFT_EVERY_S:
                 self._drift_s = time_s

@@ -93,6 +93,35 @@ def run(driver: LightDriver, clock: Clock, until_s: float, signal: Signal | None
         clock.now_s = wake_s
 
 
+class Relays(FakeLight):
+    """Relays that can be read back; `other` is a lamp that another hand has lit."""
+
+    other: Colour | None = None
+
+    def mismatch(self, colour: Colour) -> str | None:
+        return None if self.other is None else f"{colour.value} and {self.other.value} are lit"
+
+
+def test_what_is_read_back_otherwise_latches_when_it_lasts() -> None:
+    relays = Relays()
+    driver, _, clock = make(relays)
+    run(driver, clock, clock.now_s + 1, GREEN)
+    relays.other = Colour.RED
+    run(driver, clock, clock.now_s + 0.25, GREEN)
+    relays.other = None
+    run(driver, clock, clock.now_s + 1, GREEN)
+    assert driver.fault is None
+    assert Colour.ORANGE not in relays.calls
+    relays.other = Colour.RED
+    run(driver, clock, clock.now_s + 0.5, GREEN)
+    relays.other, relays.calls = None, []
+    run(driver, clock, clock.now_s + 60, GREEN)
+    assert driver.fault is not None
+    assert driver.fault.code == "lamp.latched"
+    assert "green and red are lit" in driver.fault.detail
+    assert set(relays.calls) == {Colour.ORANGE, Colour.OFF}
+
+
 def test_shows_a_steady_colour_once_and_asserts_it_again() -> None:
     driver, light, clock = make(assert_s=2.0)
     run(driver, clock, clock.now_s + 5, BLUE)
