@@ -58,8 +58,8 @@ class PictureMonitor:
         """The checks of a picture [h, w, 3] captured at `time_s`; an error in them is a fault."""
         try:
             verdicts = self._health.update(rgb, time_s)
-            # A picture that cannot be trusted says nothing of the camera's place. One that has other
-            # contents, or drops on it, may be a camera that was knocked.
+            # A picture that cannot be trusted says nothing of the camera's place. One with other
+            # contents, or with drops on it, may be that of a camera that was knocked.
             trusted = not any(
                 (v.active or v.beyond) and FAULT_KINDS[v.code].effect is not Effect.NOTICE
                 for v in verdicts
