@@ -164,13 +164,13 @@ def measure_encounters(samples: PairSamples, window_s: float = PET_WINDOW_S) -> 
 
 
 def is_conflict(samples: PairSamples, ttc_s: FloatArray, pet_s: FloatArray) -> BoolArray:
-    """Samples [n] that are a real conflict, from their TTC and PET [n]."""
+    """Samples [n] with both there that are a real conflict, from their TTC and PET [n]."""
     distance = _length(samples.cyclist_m - samples.pedestrian_m)
     relative_mps = _length(samples.cyclist_mps - samples.pedestrian_mps)
     contact = (distance < CONTACT_M) & (relative_mps > CONFLICT_MPS)
     moving = _length(samples.cyclist_mps) > CYCLIST_MOVES_MPS
-    # At a PET's first pass the cyclist may not be there yet: that he moves is in the PET.
-    return np.asarray((pet_s < CONFLICT_S) | (moving & ((ttc_s < CONFLICT_S) | contact)))
+    found = (pet_s < CONFLICT_S) | (moving & ((ttc_s < CONFLICT_S) | contact))
+    return np.asarray(found & ~np.isnan(distance))
 
 
 def _length(vector: FloatArray) -> FloatArray:

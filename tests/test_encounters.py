@@ -69,7 +69,8 @@ def brute(time_s, xy, velocity, cyclist, pedestrian):
                 continue
             if math.hypot(*(c[i] - p[j])) < 0.75:
                 pet = min(pet, abs(t - u))
-                if abs(t - u) < 1.5:
+                first = min(i, j)
+                if abs(t - u) < 1.5 and not np.isnan(c[first] + p[first]).any():
                     conflicts.append(min(t, u))
     return least, ttc, pet, drac, min(conflicts, default=math.nan)
 

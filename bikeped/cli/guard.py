@@ -18,7 +18,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 _INPUTS = (
     *("video", "scenario", "config_path", "candidate", "scenarios_dir", "added", "trace"),
     *("curve_path", "data", "images", "models", "weights", "int8", "validation", "challenge"),
-    *("picture", "points_path"),
+    *("picture", "points_path", "traffic"),
 )
 _OUTPUTS = (
     *("json_path", "overlay", "events", "audit_path", "out", "figure", "curve_out", "engine"),

@@ -34,6 +34,10 @@ _GOVERNANCE = "bikeped.lab.cli.conformance_governance"
             "bikeped.lab.cli.conformance_traffic:encounters",
             "Write random encounters as scenario files.",
         ),
+        "traffic": (
+            "bikeped.lab.cli.conformance_traffic:traffic",
+            "Real trajectories through tracker and rules: nuisance and misses.",
+        ),
         "plot": (f"{_GOVERNANCE}:plot", "Draw each scenario over time and from above."),
         "pixels": (
             "bikeped.lab.cli.conformance_pixels",

@@ -1,13 +1,21 @@
-"""`bikeped conformance encounters`: random encounters as scenario files."""
+"""`bikeped conformance traffic` and `encounters`: real trajectories, and random scenario files."""
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from bikeped.cli.common import config_options, json_option, progress_bar
+from bikeped.cli.guard import guarded
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
+from bikeped.lab.cli.conformance_shared import SuiteRun, rich_table
+
+if TYPE_CHECKING:
+    from bikeped.lab.traffic.suite import Noise
 
 
 @click.command("encounters")
@@ -33,3 +41,63 @@ def encounters(seed: int, count: int, out: Path) -> None:
     for index, scenario in enumerate(random_encounters(seed, count)):
         write_whole(out / f"encounter-{index:04d}.yaml", dump_scenario(scenario))
     click.echo(f"wrote {count} scenario files to {out}")
+
+
+@click.command("traffic")
+@click.argument("traffic", metavar="DIR", type=click.Path(path_type=Path))
+@config_options
+@click.option(
+    "--rule",
+    "rules",
+    multiple=True,
+    metavar="NAME",
+    help="Only this configuration; may be repeated. Foresight is always beside it.",
+)
+@click.option(
+    "--noise",
+    type=click.Choice(["none", "realistic", "bursts"]),
+    default="realistic",
+    show_default=True,
+    help="Localisation error and missed detections by size, alone or in bursts; or neither.",
+)
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@json_option
+@guarded
+def traffic(
+    traffic: Path,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    rules: tuple[str, ...],
+    noise: Noise,
+    seed: int,
+    json_path: str | None,
+) -> None:
+    """Real or recorded trajectories through tracker and rules: nuisance, misses, by scene.
+
+    DIR holds SCENE.csv[.gz] (time_s,id,kind,x_m,y_m; 10 Hz and more) or SUMO's SCENE.xml[.gz] (FCD
+    output), and poles.json with each scene's x_m, y_m and heading_deg of the camera.
+    """
+    from bikeped.lab.simulation.suite import CONFIGURATIONS
+    from bikeped.lab.traffic.readers import read_traffic
+    from bikeped.lab.traffic.result import traffic_result
+    from bikeped.lab.traffic.suite import TrafficSuite
+
+    run = SuiteRun(config_path, overrides, None, json_path, seed)
+    known = {**CONFIGURATIONS, "configured": run.decision}
+    if not rules and run.decision in CONFIGURATIONS.values():
+        known.pop("configured")
+    chosen = {name: known[name] for name in rules or known if name in known}
+    for name in rules:
+        if name not in chosen:
+            near = difflib.get_close_matches(name, known, 1)
+            remedy = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            raise BikepedError(f"--rule {name}: there is no such configuration; {remedy}")
+    suite = TrafficSuite.load(read_traffic(traffic), run.loaded, noise, seed)
+    with progress_bar("rules", len(chosen) + 1) as progress:
+        result = traffic_result(suite, chosen, run.loaded, progress)
+    if json_path is not None:
+        run.write_json(result.data)
+    if json_path != "-":
+        for table in result.tables:
+            run.console.print(rich_table(table))
+            run.console.print()

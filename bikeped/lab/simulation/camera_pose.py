@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.types import FloatArray
+from bikeped.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -37,3 +37,17 @@ class CameraPose:
     def _axes(self) -> FloatArray:
         c, s = math.cos(math.radians(self.heading_deg)), math.sin(math.radians(self.heading_deg))
         return np.array([[c, s], [s, -c]])
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """The ground that a camera at `pose` looks at: ahead of it, no farther than `reach_m`."""
+
+    pose: CameraPose
+    reach_m: float
+
+    def sees(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """Which world positions [..., 2] lie in the view; none that are NaN."""
+        ground = self.pose.world_to_ground(xy_m)
+        near = (ground**2).sum(-1) <= self.reach_m**2
+        return np.asarray(near & (ground[..., 0] > 0))

@@ -21,7 +21,7 @@ import numpy as np
 from bikeped.errors import BikepedError
 from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.scenarios.scenario import SIZES_M, Scenario
-from bikeped.lab.simulation.camera_pose import CameraPose
+from bikeped.lab.simulation.camera_pose import CameraPose, CameraView
 from bikeped.lab.simulation.truth import KIND_OF
 from bikeped.types import BoolArray, FloatArray, Kind, KindArray
 
@@ -93,9 +93,15 @@ class PerceptionResult:
 
 
 def simulate_perception(
-    scenario: Scenario, camera: GroundCamera, pose: CameraPose = SIMULATION_POSE
+    scenario: Scenario,
+    camera: GroundCamera,
+    pose: CameraPose = SIMULATION_POSE,
+    reach_m: float | None = None,
 ) -> PerceptionResult:
-    """Every agent of every frame as the camera localises it, in its ground frame at `pose`."""
+    """Every agent of every frame as the camera localises it, in its ground frame at `pose`.
+
+    With `reach_m` only those who are ahead of the camera and no farther are seen.
+    """
     time_s = scenario.frame_times()
     frames, agents = len(time_s), len(scenario.agents)
     true = np.full((frames, agents, 2), np.nan)
@@ -104,7 +110,9 @@ def simulate_perception(
     present = np.zeros((frames, agents), np.bool_)
     for index, agent in enumerate(scenario.agents):
         xy, heading, there = agent.sample(time_s)
-        ground = pose.world_to_ground(xy)
+        if reach_m is not None:
+            there &= CameraView(pose, reach_m).sees(xy)
+        ground = np.where(there[:, None], pose.world_to_ground(xy), np.nan)
         direction = pose.turn_to_ground(np.stack([np.cos(heading), np.sin(heading)], -1))
         true[:, index] = ground
         present[:, index] = there

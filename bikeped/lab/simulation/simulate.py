@@ -77,8 +77,8 @@ def track(
     frames = np.asarray([len(s.xy_m) for s in sequences])
     longest = int(frames.max())
     agents = max(s.xy_m.shape[1] for s in sequences)
-    xy = np.zeros((longest, batch, agents, 2))
-    kind = np.full((longest, batch, agents), -1, np.int8)
+    xy: FloatArray = np.zeros((longest, batch, agents, 2))
+    kind: KindArray = np.full((longest, batch, agents), -1, np.int8)
     for index, sequence in enumerate(sequences):
         late = sequence.delay_frames
         count = len(sequence.xy_m) - late
@@ -88,7 +88,13 @@ def track(
         detected = sequence.detected[:count]
         xy[at] = np.where(detected[..., None], sequence.xy_m[:count], 0.0)
         kind[at] = np.where(detected, sequence.kind, -1)
-    tracker = BatchTracker(settings, batch, slots=max(2 * agents, 4))
+    # In traffic few of all agents are there at a time: those who are come first.
+    order = np.argsort(kind < 0, axis=2, kind="stable")[
+        ..., : max(int((kind >= 0).sum(2).max()), 1)
+    ]
+    kind = np.take_along_axis(kind, order, 2)
+    xy = np.take_along_axis(xy, order[..., None], 2)
+    tracker = BatchTracker(settings, batch, slots=max(2 * order.shape[2], 4))
     history = _empty_history(longest, tracker)
     for frame in range(longest):
         tracker.update(frame / FPS, xy[frame], kind[frame])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bikeped.lab.scenarios.scenario import Scenario
+from bikeped.lab.simulation.camera_pose import CameraView
 from bikeped.types import BoolArray, FloatArray, IntArray, Kind
 
 #: Distracted pedestrian's perception-reaction time, s (paper, section 4.5).
@@ -103,22 +104,33 @@ class GroundTruth:
 
 
 def compute_ground_truth(
-    scenario: Scenario, settings: GroundTruthSettings = GroundTruthSettings()
+    scenario: Scenario,
+    settings: GroundTruthSettings = GroundTruthSettings(),
+    view: CameraView | None = None,
 ) -> GroundTruth:
-    """The ground truth of every frame of a scenario."""
+    """The ground truth of every frame of a scenario; with a `view`, of those who are in it."""
     time_s = scenario.frame_times()
     frames = len(time_s)
     grid_s = np.arange(_FRAME_STRIDE * (frames - 1) + _SAMPLE_STRIDE * _SAMPLES + 1) / _GRID_HZ
     cyclists = [a for a in scenario.agents if KIND_OF[a.kind] is Kind.CYCLIST]
     pedestrians = [a for a in scenario.agents if KIND_OF[a.kind] is Kind.PEDESTRIAN]
     paths = {a.id: a.sample(grid_s)[0] for a in (*cyclists, *pedestrians)}
+    if view is not None:
+        paths = {i: np.where(view.sees(xy)[:, None], xy, np.nan) for i, xy in paths.items()}
+    there = {i: ~np.isnan(xy[:, 0]) for i, xy in paths.items()}
     best = _PairTruth.none(frames)
     nearest = np.full(frames, np.inf)
     braking = BRAKING_PROFILES[settings.braking or scenario.vehicle]
     for cyclist, pedestrian in itertools.product(cyclists, pedestrians):
-        pair = _pair(cyclist.id, pedestrian.id, paths, frames, settings, braking)
-        best.replace_where_worse(pair)
-        nearest = np.fmin(nearest, pair.distance)
+        ids = cyclist.id, pedestrian.id
+        if not (there[cyclist.id] & there[pedestrian.id]).any():
+            continue
+        apart = paths[cyclist.id] - paths[pedestrian.id]
+        distance = np.sqrt((apart**2).sum(-1))  # NaN where either does not exist
+        now = distance[: _FRAME_STRIDE * frames : _FRAME_STRIDE]
+        nearest = np.fmin(nearest, now)
+        at = np.flatnonzero(now <= PAIR_RANGE_M)
+        best.replace_where_worse(_pair(*ids, paths, distance, at, settings, braking), at)
     return GroundTruth(
         time_s=time_s,
         danger=best.danger,
@@ -136,9 +148,8 @@ def compute_ground_truth(
 
 @dataclass(frozen=True)
 class _PairTruth:
-    """One pair over the frames [f]; `considered` where both exist within range."""
+    """One pair in the frames [n] in which both exist within range."""
 
-    considered: BoolArray
     danger: BoolArray
     severity: FloatArray
     ttc: FloatArray
@@ -153,53 +164,50 @@ class _PairTruth:
         """No pair in any frame."""
         false, infinite = np.zeros(frames, np.bool_), np.full(frames, np.inf)
         no_id = np.full(frames, -1, np.int64)
-        arrays: list[Any] = [false, false, np.zeros(frames), *[infinite] * 4, no_id, no_id]
+        arrays: list[Any] = [false, np.zeros(frames), *[infinite] * 4, no_id, no_id]
         return _PairTruth(*(array.copy() for array in arrays))
 
-    def replace_where_worse(self, pair: _PairTruth) -> None:
-        """Takes `pair` in the frames in which it is in danger with a higher severity, or, without
+    def replace_where_worse(self, pair: _PairTruth, frames: IntArray) -> None:
+        """Takes `pair`, of these frames, where it is in danger with a higher severity, or, without
         danger so far, has a smaller d_min. Of equal pairs the first offered stays."""
+        best = {name: values[frames] for name, values in vars(self).items()}
         # Two cyclists of one speed tie, whatever the last bit of their differences is.
-        severer = pair.severity > self.severity + _EPSILON
-        worse_danger = pair.danger & (~self.danger | severer)
-        none_yet = self.cyclist < 0
-        nearer = ~pair.danger & ~self.danger & (none_yet | (pair.d_min < self.d_min - _EPSILON))
-        at = pair.considered & (worse_danger | nearer)
+        severer = pair.severity > best["severity"] + _EPSILON
+        worse_danger = pair.danger & (~best["danger"] | severer)
+        none_yet = best["cyclist"] < 0
+        smaller = pair.d_min < best["d_min"] - _EPSILON
+        nearer = ~pair.danger & ~best["danger"] & (none_yet | smaller)
+        at = worse_danger | nearer
         for name, values in vars(self).items():
-            values[at] = getattr(pair, name)[at]
+            values[frames[at]] = getattr(pair, name)[at]
 
 
 def _pair(
     cyclist: int,
     pedestrian: int,
     paths: Mapping[int, FloatArray],
-    frames: int,
+    distance: FloatArray,
+    frames: IntArray,
     settings: GroundTruthSettings,
     braking: BrakingProfile,
 ) -> _PairTruth:
-    frame = _FRAME_STRIDE * np.arange(frames)
-    cyclist_xy, pedestrian_xy = paths[cyclist], paths[pedestrian]
-    distance = np.sqrt(
-        ((cyclist_xy - pedestrian_xy) ** 2).sum(-1)
-    )  # NaN where either does not exist
+    """The pair in these frames [n], in which both exist; `distance` on the fine grid."""
+    frame = _FRAME_STRIDE * frames
     ahead_of = np.where(np.isnan(distance), np.inf, distance)
-    # An agent exists in one interval: after its end the distance stays infinite.
+    # After an agent's end, or out of the view, the distance is infinite.
     ahead = ahead_of[frame[:, None] + _SAMPLE_STRIDE * np.arange(_SAMPLES)]
     now = distance[frame]
-    considered = now <= PAIR_RANGE_M
-    later = distance[frame + _SAMPLE_STRIDE]
-    closing = np.nan_to_num((now - later) / SAMPLE_S, nan=0.0)
+    closing = np.nan_to_num((now - distance[frame + _SAMPLE_STRIDE]) / SAMPLE_S, nan=0.0)
     d_min = ahead.min(axis=1)
     contact = ahead < CONTACT_M
     ttc = np.where(contact.any(axis=1), contact.argmax(axis=1) * SAMPLE_S, np.inf)
     near_cpa = ahead <= d_min[:, None] + CPA_SLACK_M
-    budget = np.where(np.isfinite(d_min), near_cpa.argmax(axis=1) * SAMPLE_S, np.inf)
-    cyclist_speed = _speed(cyclist_xy, frame)
-    pedestrian_speed = _speed(pedestrian_xy, frame)
+    cyclist_speed = _speed(paths[cyclist], frame)
+    pedestrian_speed = _speed(paths[pedestrian], frame)
     stopping = cyclist_speed * braking.reaction_s + cyclist_speed**2 / (
         2 * braking.deceleration_mps2
     )
-    free = np.maximum(np.nan_to_num(now, nan=np.inf) - CONTACT_M, 0.0)
+    free = np.maximum(now - CONTACT_M, 0.0)
     if settings.ttc_bound_s is None:
         clearance = np.where(
             pedestrian_speed < STANDING_MPS,
@@ -208,24 +216,22 @@ def _pair(
         )
         bound: FloatArray = PEDESTRIAN_PRT_S + clearance
     else:
-        bound = np.full(frames, settings.ttc_bound_s)
+        bound = np.full(len(frames), settings.ttc_bound_s)
     danger = (
-        considered
-        & (closing > CLOSING_MIN_MPS)
+        (closing > CLOSING_MIN_MPS)
         & (d_min < settings.cpa_radius_m)
         & ((stopping > settings.stopping_margin * free) | (ttc < bound))
     )
     return _PairTruth(
-        considered=considered,
         danger=danger,
         # Kinetic energy relative to that at 12 m/s, at most 1.
         severity=np.minimum((cyclist_speed / SEVERITY_SPEED_MPS) ** 2, 1.0),
         ttc=ttc,
         d_min=d_min,
-        budget=budget,
+        budget=near_cpa.argmax(axis=1) * SAMPLE_S,
         distance=now,
-        cyclist=np.full(frames, cyclist, np.int64),
-        pedestrian=np.full(frames, pedestrian, np.int64),
+        cyclist=np.full(len(frames), cyclist, np.int64),
+        pedestrian=np.full(len(frames), pedestrian, np.int64),
     )
 
 

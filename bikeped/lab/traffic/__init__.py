@@ -1,0 +1,1 @@
+"""Real or recorded traffic through tracker and rules: nuisance and misses."""
