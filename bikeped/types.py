@@ -133,19 +133,28 @@ class Detections:
 @dataclass(frozen=True)
 class GroundPoints:
     """Detections on the ground: `kind` [n], `xy_m` [n, 2], `detection` [n] their index, `ridden`
-    [n] as in `Detections`."""
+    and `confidence` [n] as in `Detections` (None: not known)."""
 
     kind: KindArray
     xy_m: FloatArray
     detection: IntArray
     ridden: BoolArray | None = None
+    confidence: Float32Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.kind)
-        _check_shapes(self, xy_m=(n, 2), detection=(n,), ridden=(n,))
+        _check_shapes(self, xy_m=(n, 2), detection=(n,), ridden=(n,), confidence=(n,))
 
     def __len__(self) -> int:
         return len(self.kind)
+
+    def take(self, index: IntArray) -> GroundPoints:
+        """The points at `index`, in that order."""
+        ridden = None if self.ridden is None else self.ridden[index]
+        confidence = None if self.confidence is None else self.confidence[index]
+        return GroundPoints(
+            self.kind[index], self.xy_m[index], self.detection[index], ridden, confidence
+        )
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 Detectors trained on COCO return two boxes for a rider, `person` and `bicycle`. Unjoined, every
 cyclist would carry a pedestrian along, closing in on it forever. The joined box is the union, so
-its bottom centre is on the wheel line; its confidence is the greater of the two.
+its bottom centre is on the wheel line; its confidence is the cycle's, for a confident person over
+what may be a bicycle is not a confident cyclist.
 
 A person beside, in front of or behind a cycle stays a pedestrian: the cycle must cover the person
 from the waist down, the person's middle must be over the cycle, the feet near the wheel line and
@@ -105,7 +106,6 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
             rider, own = person[i], cycle[j]
             box[own, :2] = np.minimum(box[rider, :2], box[own, :2])
             box[own, 2:] = np.maximum(box[rider, 2:], box[own, 2:])
-            score[own] = max(score[rider], score[own])
             # A second box of the rider (head and shoulders) must not stay a pedestrian, nor a wheel
             # of the cycle another cyclist.
             shared = intersection_area(found.box_px[person], found.box_px[rider])
@@ -117,7 +117,8 @@ def join_riders(found: Detections, overlap: float, confidence: float) -> Detecti
             part = (shared >= _MIN_PART_WITHIN * area) & (
                 area <= _MAX_PART_SIZE * box_area(box[own])
             )
-            dropped[cycle[part & ~ridden[cycle] & (found.confidence[cycle] <= score[own])]] = True
+            fainter = found.confidence[cycle] <= max(score[rider], score[own])
+            dropped[cycle[part & ~ridden[cycle] & fainter]] = True
     left = np.nonzero(~dropped)[0]
     order = left[np.argsort(-score[left], kind="stable")]
     return Detections(found.kind[order], score[order], box[order], ridden[order])

@@ -21,7 +21,7 @@ from bikeped.faults import Fault
 from bikeped.geometry.camera import GroundTable
 from bikeped.geometry.framing import Framing
 from bikeped.tracking.tracker import Tracker, predict
-from bikeped.types import Decision, Detections, Float32Array, FloatArray, GroundPoints, Kind, Tracks
+from bikeped.types import Decision, Detections, FloatArray, GroundPoints, Kind, Tracks
 
 #: Road users of one kind that are tracked of one frame, so that the decision stays under 5 ms
 #: whatever the detector returns. A cap a kind, for vehicles must not push out cyclists; and as 48
@@ -56,8 +56,14 @@ class GroundMapper:
         xy, valid = self.table.lookup(crop)
         near = valid & (np.nan_to_num(np.hypot(xy[:, 0], xy[:, 1]), nan=np.inf) < self._max_range_m)
         index = np.nonzero(near)[0]
-        ridden = None if detections.ridden is None else detections.ridden[index]
-        points = GroundPoints(detections.kind[index], xy[index], index.astype(np.int64), ridden)
+        near_ones = detections.take(index)
+        points = GroundPoints(
+            near_ones.kind,
+            xy[index],
+            index.astype(np.int64),
+            near_ones.ridden,
+            near_ones.confidence,
+        )
         return points, int((~valid).sum())
 
 
@@ -124,7 +130,7 @@ class TrackAndDecide:
         points, not_on_ground = mapper.to_ground(detections, mapper.framing_for(width, height))
         self.fault = None
         if np.bincount(points.kind, minlength=1).max() > MAX_OF_A_KIND:
-            points = _most_confident(points, detections.confidence)
+            points = _most_confident(points)
             self.capped_frames += 1
             self.fault = CROWDED
         return self.update_from_points(points, captured_s, age_s, not_on_ground, began)
@@ -167,14 +173,11 @@ class TrackAndDecide:
         return predict(tracks.xy_m, velocity, acceleration, ahead_s, latency.order)
 
 
-def _most_confident(points: GroundPoints, confidence: Float32Array) -> GroundPoints:
-    """Of each kind the `MAX_OF_A_KIND` most confident, of equals the nearest to the camera.
-
-    `confidence` [d] is that of the detections, which `points.detection` numbers.
-    """
+def _most_confident(points: GroundPoints) -> GroundPoints:
+    """Of each kind the `MAX_OF_A_KIND` most confident, of equals the nearest to the camera."""
+    if points.confidence is None:
+        return points
     distance_m = np.hypot(points.xy_m[:, 0], points.xy_m[:, 1])
-    order = np.lexsort((distance_m, -confidence[points.detection]))
+    order = np.lexsort((distance_m, -points.confidence))
     kind = points.kind[order]
-    kept = np.sort(np.concatenate([order[kind == k][:MAX_OF_A_KIND] for k in Kind]))
-    ridden = None if points.ridden is None else points.ridden[kept]
-    return GroundPoints(points.kind[kept], points.xy_m[kept], points.detection[kept], ridden)
+    return points.take(np.sort(np.concatenate([order[kind == k][:MAX_OF_A_KIND] for k in Kind])))

@@ -13,20 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from bikeped.tracking.kalman import MotionNoise, correct
+from bikeped.tracking.kinds import cycle_evidence, first_kind, next_kind
 from bikeped.tracking.matching import IndexArray, match_greedy
-from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
+from bikeped.types import BoolArray, Float32Array, FloatArray, IntArray, Kind, KindArray
 
 #: Slack of comparisons between times, far below a frame and far above rounding.
 _EPSILON_S = 1e-6
 _PEDESTRIAN, _CYCLIST, _VEHICLE = (int(k) for k in (Kind.PEDESTRIAN, Kind.CYCLIST, Kind.VEHICLE))
-#: A track's kind follows its detections (see `TrackerSettings.rider_radius_m`): weight of the
-#: newest in the smoothed share of cycles among them, a time constant of 0.4 s at 30 frames/s.
-_CYCLE_WEIGHT = 0.08
-#: Above the first share a pedestrian becomes a cyclist, below the second the reverse. Where a
-#: bicycle is easily missed, two in a row make a cyclist, and 0.7 to 2.3 s of persons alone a
-#: pedestrian again; where one box holds rider and cycle, the most frequent kind is the right one.
-_CYCLE_SHARES = (0.12, 0.03)
-_MAJORITY_SHARES = (0.55, 0.45)
 #: Weight of the newest step in the smoothed acceleration, per nominal frame.
 _ACCELERATION_WEIGHT = 0.15
 #: A cyclist's track unseen for longer is not continued by a detection of a person.
@@ -116,13 +109,19 @@ class BatchTracker:
         return self.alive & (self.hits >= self.settings.confirm_hits)
 
     def update(
-        self, time_s: float, xy_m: FloatArray, kind: KindArray, ridden: BoolArray | None = None
+        self,
+        time_s: float,
+        xy_m: FloatArray,
+        kind: KindArray,
+        ridden: BoolArray | None = None,
+        confidence: Float32Array | None = None,
     ) -> None:
         """Advances every scene to `time_s` with detections `xy_m` [batch, n, 2] in metres.
 
         `kind` [batch, n]; -1 marks an unused place, for scenes differ in their number of
-        detections. `ridden` [batch, n]: cycles whose rider was seen with them. ValueError when
-        time goes back.
+        detections. `ridden` [batch, n]: cycles whose rider was seen with them; `confidence`
+        [batch, n]: of the detections, of a ridden cycle that of the cycle alone; None: all clear.
+        ValueError when time goes back.
         """
         if time_s < self.time_s:
             raise ValueError(f"time_s: {time_s} is before the last update at {self.time_s}")
@@ -136,7 +135,9 @@ class BatchTracker:
         self.xy_m += self.velocity_mps * step_s  # free slots move along, unread
         matched, refused = self._match(xy_m, kind)
         self.detection = matched
-        self._correct(time_s, xy_m, kind, matched)
+        whole = self.settings.cyclist_box_includes_rider
+        cycle = cycle_evidence(kind, None if whole else confidence)
+        self._correct(time_s, xy_m, kind, matched, cycle)
         self._find_parked(time_s, xy_m, kind, ridden)
         self._drop(time_s)
         fresh = kind >= 0
@@ -147,7 +148,7 @@ class BatchTracker:
         if np.count_nonzero(fresh):
             if self.settings.max_tracks:
                 self._make_room(fresh)
-            self._add(time_s, xy_m, kind, fresh)
+            self._add(time_s, xy_m, kind, fresh, cycle, ridden)
 
     def _match(self, xy_m: FloatArray, kind: KindArray) -> tuple[IndexArray, BoolArray | None]:
         """Detection of each slot, and the detections that only the gate kept from a free track."""
@@ -193,7 +194,7 @@ class BatchTracker:
     ) -> None:
         """Matches free pedestrians with free cyclists' tracks (riders), and the reverse.
 
-        Writes into `matched`; `_update_kind` decides the kind of the track.
+        Writes into `matched`; `kinds` decides the kind of the track.
         """
         taken = np.zeros(len(refused), np.bool_)
         taken[matched[matched >= 0]] = True
@@ -221,7 +222,12 @@ class BatchTracker:
         return np.where(shaped >= 0, shaped - np.arange(len(shaped))[:, None] * detections, -1)
 
     def _correct(
-        self, time_s: float, xy_m: FloatArray, kind: KindArray, matched: IndexArray
+        self,
+        time_s: float,
+        xy_m: FloatArray,
+        kind: KindArray,
+        matched: IndexArray,
+        cycle: FloatArray,
     ) -> None:
         # Views with one flat index over the batch: half the time of indexing scene and slot.
         flat = (matched.ravel() >= 0).nonzero()[0]
@@ -274,7 +280,7 @@ class BatchTracker:
         seen_s[flat] = time_s
         hits[flat] += 1
         if self.settings.rider_radius_m > 0:
-            self._update_kind(flat, kind.ravel()[place])
+            self._update_kind(flat, cycle.ravel()[place])
 
     def _find_parked(
         self, time_s: float, xy_m: FloatArray, kind: KindArray, ridden: BoolArray | None
@@ -297,25 +303,12 @@ class BatchTracker:
         alone = time_s - self._person_s[scene, slot] > _PERSON_MEMORY_S
         self.parked[scene, slot] = alone & (stood_s[scene, slot] >= _PARKED_AFTER_S - _EPSILON_S)
 
-    def _update_kind(self, flat: IndexArray, seen: KindArray) -> None:
-        """Lets the kind of pedestrians and cyclists follow their recent detections."""
+    def _update_kind(self, flat: IndexArray, cycle: FloatArray) -> None:
         share, kind = self._cycle_share.reshape(-1), self.kind.reshape(-1)
-        if not np.count_nonzero(share[flat] != (seen == _CYCLIST)):
-            return  # detected as always
-        majority = self.settings.cyclist_box_includes_rider
-        hits = self.hits.reshape(-1)[flat]
-        weight: float | FloatArray = _CYCLE_WEIGHT
-        if majority:  # a young track has few detections: all of them count alike
-            weight = np.maximum(_CYCLE_WEIGHT, 1 / hits)
-        share[flat] += weight * ((seen == _CYCLIST) - share[flat])
-        on, off = _MAJORITY_SHARES if majority else _CYCLE_SHARES
-        old = kind[flat]
-        rides = (old == _PEDESTRIAN) & (share[flat] > on)
-        walks = (old == _CYCLIST) & (share[flat] < off)
-        if majority:  # of the first two the newer is likelier right: most people come nearer
-            rides |= (hits == 2) & (seen == _CYCLIST)
-            walks |= (hits == 2) & (seen == _PEDESTRIAN)
-        kind[flat] = np.where(rides, _CYCLIST, np.where(walks, _PEDESTRIAN, old))
+        if np.count_nonzero(share[flat] != cycle):  # else detected as always
+            hits = self.hits.reshape(-1)[flat]
+            whole = self.settings.cyclist_box_includes_rider
+            kind[flat], share[flat] = next_kind(kind[flat], share[flat], cycle, hits, whole)
 
     def _drop(self, time_s: float) -> None:
         unseen = time_s - self.seen_s
@@ -335,7 +328,15 @@ class BatchTracker:
             order = np.lexsort((self.seen_s[scene, unseen], confirmed))
             self.alive[scene, unseen[order[: over[scene]]]] = False
 
-    def _add(self, time_s: float, xy_m: FloatArray, kind: KindArray, fresh: BoolArray) -> None:
+    def _add(
+        self,
+        time_s: float,
+        xy_m: FloatArray,
+        kind: KindArray,
+        fresh: BoolArray,
+        cycle: FloatArray,
+        ridden: BoolArray | None,
+    ) -> None:
         need = fresh.sum(axis=1)
         while (need > (~self.alive).sum(axis=1)).any():
             self._grow()
@@ -347,7 +348,11 @@ class BatchTracker:
         self.alive[at] = True
         self.id[at] = self._next_id[scene] + rank
         self._next_id += need
-        self.kind[at] = kind[scene, detection]
+        self.kind[at], self._cycle_share[at] = first_kind(
+            kind[scene, detection],
+            cycle[scene, detection],
+            None if ridden is None else ridden[scene, detection],
+        )
         self.xy_m[at] = xy_m[scene, detection]
         self._seen_xy_m[at] = self._stands_xy_m[at] = xy_m[scene, detection]
         self._stands_s[at] = time_s
@@ -358,7 +363,6 @@ class BatchTracker:
         self.covariance[at] = self._motion[1][kind[scene, detection]]
         self.seen_s[at] = time_s
         self.hits[at] = 1
-        self._cycle_share[at] = kind[scene, detection] == _CYCLIST
         self.detection[at] = detection
 
     def _grow(self) -> None:

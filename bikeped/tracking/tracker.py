@@ -34,7 +34,8 @@ class Tracker:
         """Tracks at `time_s` (seconds), updated with that frame's ground points."""
         batch = self.batch
         ridden = None if points.ridden is None else points.ridden[None]
-        batch.update(time_s, points.xy_m[None], points.kind[None], ridden)
+        confidence = None if points.confidence is None else points.confidence[None]
+        batch.update(time_s, points.xy_m[None], points.kind[None], ridden, confidence)
         slot = batch.reported[0].nonzero()[0]
         slot = slot[batch.id[0][slot].argsort(kind="stable")]
         ids = batch.id[0][slot]

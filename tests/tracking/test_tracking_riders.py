@@ -24,10 +24,13 @@ SETTINGS = TrackerSettings(
 WHOLE = replace(SETTINGS, cyclist_box_includes_rider=True)
 
 
-def feed(tracker: BatchTracker, frame: int, *detections: tuple[int, float, float]) -> None:
-    xy = np.asarray([[x, y] for _, x, y in detections]).reshape(1, -1, 2)
-    kind = np.asarray([[k for k, _, _ in detections]], np.int8).reshape(1, -1)
-    tracker.update(frame / 30, xy, kind)
+def feed(tracker: BatchTracker, frame: int, *detections: tuple[float, ...]) -> None:
+    """Detections are (kind, x, y); those with a confidence are joined riders."""
+    xy = np.asarray([p[1:3] for p in detections]).reshape(1, -1, 2)
+    kind = np.asarray([[p[0] for p in detections]], np.int8).reshape(1, -1)
+    confidence = np.asarray([[p[3] if len(p) > 3 else 1.0 for p in detections]], np.float32)
+    ridden = (kind == C) & (confidence < 1)
+    tracker.update(frame / 30, xy, kind, ridden, confidence)
 
 
 def kinds(tracker: BatchTracker) -> dict[int, int]:
@@ -56,6 +59,39 @@ def test_one_false_bicycle_does_not_make_a_walker_a_cyclist():
     for frame in range(60):
         feed(tracker, frame, (C if frame == 30 else P, 1.3 * frame / 30, 5.0))
         assert kinds(tracker) == {1: P}
+
+
+@pytest.mark.parametrize("first", [0, 5, 40])
+@pytest.mark.parametrize("gap", [1, 3])
+def test_two_faint_bicycles_under_a_walker_do_not_make_a_cyclist(first, gap):
+    tracker = BatchTracker(SETTINGS)
+    for step in range(60):
+        faint = (C, 1.3 * step * gap / 30, 5.0, 0.14)
+        feed(tracker, step * gap, faint if step in (first, first + 1) else (P, *faint[1:3]))
+        assert kinds(tracker) == {1: P}
+
+
+@pytest.mark.parametrize("confidence", [0.1, 0.15, 0.3])
+def test_a_rider_whose_bicycle_is_faint_but_found_again_and_again_is_a_cyclist(confidence):
+    tracker = BatchTracker(SETTINGS)
+    rng = np.random.default_rng(8)
+    called = []
+    for frame in range(120):
+        found = rng.random() < 0.8
+        place = (4.0 * frame / 30, 5.0)
+        feed(tracker, frame, (C, *place, confidence) if found else (P, *place))
+        called += kinds(tracker).values()
+    assert len(called) == 120
+    assert called[20:] == [C] * 100
+
+
+def test_a_bicycle_without_a_person_is_a_cyclist_however_faint():
+    tracker = BatchTracker(SETTINGS)
+    xy, kind = np.array([[[4.0, 5.0]]]), np.array([[C]], np.int8)
+    alone, faint = np.zeros((1, 1), np.bool_), np.full((1, 1), 0.11, np.float32)
+    for frame in range(30):
+        tracker.update(frame / 30, xy, kind, alone, faint)
+        assert kinds(tracker) == {1: C}
 
 
 def test_who_gets_off_and_walks_is_a_pedestrian_again():
