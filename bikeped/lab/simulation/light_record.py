@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from bikeped.decision.episodes import runs
 from bikeped.decision.shown import shown_states
-from bikeped.lab.simulation.metrics import GroundTruthFrames, finite_or_none, measure
+from bikeped.lab.simulation.metrics import GroundTruthFrames, finite_or_none, mean_known, measure
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.types import BoolArray, FloatArray, IntArray, State
@@ -40,9 +40,6 @@ class Conflicts:
     @property
     def fair(self) -> BoolArray:
         return np.asarray(self.in_view_s >= FAIR_S - _EPSILON_S)
-
-
-NO_CONFLICTS = Conflicts(np.zeros(0), np.zeros(0), np.zeros((0, 2), np.int64))
 
 
 @dataclass(frozen=True)
@@ -177,6 +174,7 @@ def _metric_figures(truth: GroundTruthFrames, lights: Sequence[LightRecord]) -> 
         "contact_sensitivity_raw": finite_or_none(before.contact_sensitivity),
         "sev_fn": finite_or_none(after.sev_fn),
         "mean_warning_budget_s": finite_or_none(after.mean_warning_budget_s),
+        "first_onset_lead_s": finite_or_none(mean_known(after.by_scenario["first_onset_lead_s"])),
         "held_frames": int(held.sum()),
     }
 

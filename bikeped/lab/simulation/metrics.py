@@ -146,10 +146,10 @@ def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
         sensitivity=_share(tp.sum(), fn.sum()),
         specificity=_share(tn.sum(), fp.sum()),
         contact_sensitivity=_share(contact_hit, int(truth.contact.sum()) - contact_hit),
-        sev_fn=_mean(sev_fn),
+        sev_fn=mean_known(sev_fn),
         fatigue=float(fatigue.mean()),
-        mean_alert_latency_s=_mean(np.where(np.isinf(latency), NO_ALERT_LATENCY_S, latency)),
-        mean_warning_budget_s=_mean(mean_budget),
+        mean_alert_latency_s=mean_known(np.where(np.isinf(latency), NO_ALERT_LATENCY_S, latency)),
+        mean_warning_budget_s=mean_known(mean_budget),
         adequate_share=_share(
             int((budgets > PEDESTRIAN_PRT_S).sum()), int((budgets <= PEDESTRIAN_PRT_S).sum())
         ),
@@ -205,6 +205,7 @@ def _ratio(part: FloatArray, whole: FloatArray) -> FloatArray:
     return np.where(whole > 0, part / np.where(whole > 0, whole, 1.0), np.nan)
 
 
-def _mean(values: FloatArray) -> float:
+def mean_known(values: FloatArray) -> float:
+    """The mean of those that are not NaN; NaN where all are."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else float("nan")

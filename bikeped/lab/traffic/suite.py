@@ -5,25 +5,26 @@ The same functions as for scenarios (`lab.simulation`); only who is in the camer
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from bikeped.config.build import ground_camera, rule_settings, tracker_settings
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig
-from bikeped.decision.rules import RuleSettings, is_remembered, resolve_state
-from bikeped.decision.shown import shown_alert
+from bikeped.decision.rules import is_remembered, resolve_state
+from bikeped.decision.shown import ShownSettings, shown_alert
 from bikeped.encounters import CONFLICT_S, measure_encounters, pair_samples
 from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.scenarios.scenario import Scenario
 from bikeped.lab.simulation.camera_pose import CameraView
-from bikeped.lab.simulation.light_record import NO_CONFLICTS, Conflicts, LightRecord
+from bikeped.lab.simulation.light_record import Conflicts, LightRecord
 from bikeped.lab.simulation.perception import (
+    SIMULATION_POSE,
     PerceptionResult,
     RecallModel,
     missed_detections,
@@ -41,9 +42,10 @@ from bikeped.lab.simulation.simulate import (
 from bikeped.lab.simulation.truth import KIND_OF, GroundTruth, compute_ground_truth
 from bikeped.lab.traffic.readers import TrafficScene
 from bikeped.tracking.batch_tracker import TrackerSettings
-from bikeped.types import BoolArray, FloatArray, IntArray, Kind, State
+from bikeped.types import BoolArray, FloatArray, Kind, State
 
-Noise = Literal["none", "realistic", "bursts"]
+#: `located`: localisation error, and no detection missed.
+Noise = Literal["none", "located", "realistic", "bursts"]
 #: Who is farther from the camera, or beside and behind it, does not count, metres.
 VIEW_M = 25.0
 #: The detector finds people this far, so that tracks are there when they begin to count, metres.
@@ -54,13 +56,20 @@ BURST_FRAMES = 5.0
 
 @dataclass(frozen=True)
 class TrafficSuite:
-    """Scenes, the camera that every pole carries, its tracker, and how the detector errs."""
+    """Scenes, the camera that every pole carries, its tracker, and how the detector errs.
+
+    `view_m` and `seen_m`: how far people count, and are found; None: everywhere. Detections reach
+    the tracker `delay_frames` late.
+    """
 
     scenes: tuple[TrafficScene, ...]
     camera: GroundCamera
     tracker: TrackerSettings
     noise: Noise = "realistic"
     seed: int = 0
+    view_m: float | None = VIEW_M
+    seen_m: float | None = SEEN_M
+    delay_frames: int = 0
 
     @staticmethod
     def load(
@@ -70,10 +79,19 @@ class TrafficSuite:
         tracker = tracker_settings(loaded.config.tracking, loaded.config.decision.nominal_fps)
         return TrafficSuite(tuple(scenes), ground_camera(loaded), tracker, noise, seed)
 
-    def with_noise(self, noise: Noise, seed: int) -> TrafficSuite:
+    @staticmethod
+    def of_scenarios(
+        scenarios: Iterable[Scenario], loaded: LoadedConfig, noise: Noise, seed: int
+    ) -> TrafficSuite:
+        """Scripted or random scenarios as the conformance simulation has them, seen everywhere."""
+        scenes = [TrafficScene(scenario, SIMULATION_POSE) for scenario in scenarios]
+        suite = TrafficSuite.load(scenes, loaded, noise, seed)
+        return replace(suite, view_m=None, seen_m=None)
+
+    def with_noise(self, noise: Noise, seed: int, delay_frames: int = 0) -> TrafficSuite:
         """The same scenes under other noise; what does not depend on it is kept."""
-        other = replace(self, noise=noise, seed=seed)
-        for name in ("truths", "conflicts", "present", "perception_results"):
+        other = replace(self, noise=noise, seed=seed, delay_frames=delay_frames)
+        for name in ("truths", "_in_view", "present", "conflicts", "perception_results"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
@@ -84,46 +102,69 @@ class TrafficSuite:
 
     @cached_property
     def truths(self) -> tuple[GroundTruth, ...]:
-        return tuple(
-            compute_ground_truth(s.scenario, view=CameraView(s.pose, VIEW_M)) for s in self.scenes
-        )
+        return tuple(compute_ground_truth(s.scenario, view=self._view(s)) for s in self.scenes)
+
+    def _view(self, scene: TrafficScene) -> CameraView | None:
+        return None if self.view_m is None else CameraView(scene.pose, self.view_m)
+
+    @cached_property
+    def _in_view(self) -> tuple[FloatArray, ...]:
+        """By scene: world positions [f, a, 2]; NaN where one is absent or out of view."""
+        found = []
+        for scene in self.scenes:
+            xy, view = _positions(scene.scenario), self._view(scene)
+            found.append(xy if view is None else np.where(view.sees(xy)[..., None], xy, np.nan))
+        return tuple(found)
 
     @cached_property
     def present(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
         """By scene: frames [f] with a cyclist in view, and with a pedestrian."""
-        return tuple((_any_of(s, Kind.CYCLIST), _any_of(s, Kind.PEDESTRIAN)) for s in self.scenes)
+        found = []
+        for scene, xy in zip(self.scenes, self._in_view, strict=True):
+            there = ~np.isnan(xy[..., 0])
+            kinds = (_of_kind(scene.scenario, k) for k in (Kind.CYCLIST, Kind.PEDESTRIAN))
+            cyclist, pedestrian = (np.asarray(there[:, who].any(axis=1)) for who in kinds)
+            found.append((cyclist, pedestrian))
+        return tuple(found)
 
     @cached_property
     def conflicts(self) -> tuple[Conflicts, ...]:
-        return tuple(_real_conflicts(s) for s in self.scenes)
+        scenes = zip(self.scenes, self._in_view, strict=True)
+        return tuple(_real_conflicts(scene.scenario, xy) for scene, xy in scenes)
 
     @cached_property
     def perception_results(self) -> tuple[PerceptionResult, ...]:
         return tuple(
-            simulate_perception(s.scenario, self.camera, s.pose, SEEN_M) for s in self.scenes
+            simulate_perception(s.scenario, self.camera, s.pose, self.seen_m) for s in self.scenes
         )
+
+    @cached_property
+    def detections(self) -> tuple[DetectionSequence, ...]:
+        """What the tracker gets, scene by scene."""
+        found = zip(self.names, self.perception_results, strict=True)
+        return tuple(self._detections(*item) for item in found)
+
+    def _detections(self, name: str, seen: PerceptionResult) -> DetectionSequence:
+        place = seen.true_m if self.noise == "none" else seen.observed_m
+        found = seen.present
+        if self.noise in {"realistic", "bursts"}:
+            found = found & ~missed_detections(
+                trial_generator(self.seed, name, 0).random(found.shape),
+                seen.recall(RecallModel("size")),
+                found,
+                BURST_FRAMES if self.noise == "bursts" else None,
+            )
+        return DetectionSequence(place, found, seen.kind, self.delay_frames)
 
     @cached_property
     def rule_input(self) -> RuleInput:
         """Track rows of all scenes, of the detections with this suite's noise."""
-        found = zip(self.names, self.perception_results, strict=True)
-        return build_rule_input(track([self._detections(*item) for item in found], self.tracker))
-
-    def _detections(self, name: str, seen: PerceptionResult) -> DetectionSequence:
-        if self.noise == "none":
-            return DetectionSequence(seen.true_m, seen.present, seen.kind)
-        missed = missed_detections(
-            trial_generator(self.seed, name, 0).random(seen.present.shape),
-            seen.recall(RecallModel("size")),
-            seen.present,
-            BURST_FRAMES if self.noise == "bursts" else None,
-        )
-        return DetectionSequence(seen.observed_m, seen.present & ~missed, seen.kind)
+        return build_rule_input(track(self.detections, self.tracker))
 
     def lights(self, decision: DecisionConfig) -> list[LightRecord]:
         """What the light does in every scene under a decision."""
         settings = rule_settings(decision)
-        return self._records(states(self.rule_input, settings), settings)
+        return self.records(states(self.rule_input, settings), settings.shown)
 
     def foresight(self, decision: DecisionConfig) -> list[LightRecord]:
         """The light that knows danger itself, with the decision's window, hold and memory."""
@@ -133,11 +174,10 @@ class TrafficSuite:
             last_s = np.maximum.accumulate(np.where(cyclist, truth.time_s, -np.inf))
             memory = is_remembered(truth.time_s, last_s, settings.memory_s)
             raw.append(resolve_state(pedestrian, memory, truth.danger))
-        return self._records(np.concatenate(raw), settings)
+        return self.records(np.concatenate(raw), settings.shown)
 
-    def _records(
-        self, raw: np.ndarray[tuple[int, ...], np.dtype[np.int8]], settings: RuleSettings
-    ) -> list[LightRecord]:
+    def records(self, raw: npt.NDArray[np.int8], shown: ShownSettings) -> list[LightRecord]:
+        """The light of every scene from the raw state codes of all frames, scene after scene."""
         parts = np.split(raw, np.cumsum([len(t.time_s) for t in self.truths])[:-1])
         scenes = zip(parts, self.truths, self.present, self.conflicts, strict=True)
         return [
@@ -146,55 +186,36 @@ class TrafficSuite:
                 cyclist & pedestrian,
                 conflicts,
                 own,
-                shown_alert(truth.time_s, own == int(State.ALERT), settings.shown),
+                shown_alert(truth.time_s, own == int(State.ALERT), shown),
             )
             for own, truth, (cyclist, pedestrian), conflicts in scenes
         ]
 
 
-def positions_in_view(scene: TrafficScene, time_s: FloatArray) -> FloatArray:
-    """World positions [f, a, 2] of all road users; NaN where one is absent or out of view."""
-    xy = np.stack([a.sample(time_s)[0] for a in scene.scenario.agents], 1)
-    return np.where(CameraView(scene.pose, VIEW_M).sees(xy)[..., None], xy, np.nan)
-
-
-def _any_of(scene: TrafficScene, kind: Kind) -> BoolArray:
-    time_s = scene.scenario.frame_times(FPS)
-    xy = positions_in_view(scene, time_s)[:, _of_kind(scene.scenario, kind)]
-    return np.asarray((~np.isnan(xy[..., 0])).any(axis=1))
+def _positions(scenario: Scenario) -> FloatArray:
+    """World positions [f, a, 2] of all road users; NaN where one is absent."""
+    time_s = scenario.frame_times(FPS)
+    return np.stack([agent.sample(time_s)[0] for agent in scenario.agents], 1)
 
 
 def _of_kind(scenario: Scenario, kind: Kind) -> list[int]:
     return [i for i, a in enumerate(scenario.agents) if KIND_OF[a.kind] is kind]
 
 
-def _real_conflicts(scene: TrafficScene) -> Conflicts:
-    """Real conflicts of a scene, and how long each pair had been in view."""
-    time_s = scene.scenario.frame_times(FPS)
-    xy = positions_in_view(scene, time_s)
-    pairs: IntArray = np.asarray(
-        list(
-            itertools.product(
-                *(_of_kind(scene.scenario, k) for k in (Kind.CYCLIST, Kind.PEDESTRIAN))
-            )
-        ),
-        np.int64,
-    ).reshape(-1, 2)
-    if not len(pairs):
-        return NO_CONFLICTS
-    # Velocities of the whole path: at the edge of the view they are known, too.
-    whole = np.stack([a.sample(time_s)[0] for a in scene.scenario.agents], 1)
-    velocity = np.gradient(whole, 1 / FPS, axis=0)
+def _real_conflicts(scenario: Scenario, xy: FloatArray) -> Conflicts:
+    """Real conflicts of those in view at `xy` [f, a, 2], and how long each pair had been there."""
+    cyclists, pedestrians = (_of_kind(scenario, k) for k in (Kind.CYCLIST, Kind.PEDESTRIAN))
+    pairs = np.asarray([[c, p] for c in cyclists for p in pedestrians], np.int64).reshape(-1, 2)
+    time_s = scenario.frame_times(FPS)
+    # Velocities of the whole paths: where somebody enters the view they are known, too.
+    velocity = np.gradient(_positions(scenario), 1 / FPS, axis=0)
     found = measure_encounters(pair_samples(time_s, xy, velocity, pairs, CONFLICT_S), CONFLICT_S)
-    there = ~np.isnan(xy[..., 0])
     which = np.flatnonzero(~np.isnan(found.conflict_s))
-    at_s = found.conflict_s[which]
-    in_view_s = np.zeros(len(which))
-    for i, (pair, t) in enumerate(zip(pairs[which], at_s, strict=True)):
-        frame = round(float(t) * FPS)
-        together = there[: frame + 1, pair].all(axis=1)
-        absent = np.flatnonzero(~together)
-        in_view_s[i] = (frame - (absent[-1] if len(absent) else -1)) / FPS
-    ids = np.asarray([a.id for a in scene.scenario.agents])
-    order = np.argsort(at_s, kind="stable")
-    return Conflicts(at_s[order], in_view_s[order], ids[pairs[which]][order])
+    which = which[np.argsort(found.conflict_s[which], kind="stable")]
+    there = ~np.isnan(xy[..., 0])
+    at_s, in_view_s = found.conflict_s[which], np.zeros(len(which))
+    for i, (pair, frame) in enumerate(zip(pairs[which], np.rint(at_s * FPS), strict=True)):
+        absent = np.flatnonzero(~there[: int(frame) + 1, pair].all(axis=1))
+        in_view_s[i] = (frame - absent[-1] if len(absent) else frame + 1) / FPS
+    ids = np.asarray([agent.id for agent in scenario.agents])
+    return Conflicts(at_s, in_view_s, ids[pairs[which]])
