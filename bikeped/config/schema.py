@@ -166,21 +166,21 @@ class TrackingConfig(Section, frozen=True):
     """largest distance between a detection and the track that it is matched with, m"""
     max_unseen_s: Annotated[float, Meta(ge=0, le=30)] = 10.0
     """an unseen track coasts at constant velocity this long, s"""
-    measurement_noise_pedestrian_m: Annotated[float, Meta(gt=0, le=5)] = 0.08
+    measurement_noise_pedestrian_m: Annotated[float, Meta(gt=0, le=5)] = 0.10
     """standard deviation of a detection's place, on each axis: the jitter of real boxes at 10 m is
     0.05 to 0.15; a larger one makes tracks calmer and later, m"""
-    measurement_noise_cyclist_m: Annotated[float, Meta(gt=0, le=5)] = 0.10
+    measurement_noise_cyclist_m: Annotated[float, Meta(gt=0, le=5)] = 0.12
     """the same of cyclists and vehicles, whose boxes are larger, m"""
-    acceleration_pedestrian_mps2: Annotated[float, Meta(gt=0, le=50)] = 3.0
+    acceleration_pedestrian_mps2: Annotated[float, Meta(gt=0, le=50)] = 2.5
     """standard deviation of the acceleration, anew every nominal frame: after a second of it the
-    speed has changed by 0.55 m/s, as walkers' do, m/s^2"""
-    acceleration_cyclist_mps2: Annotated[float, Meta(gt=0, le=50)] = 6.0
-    """the same of cyclists and vehicles: 1.1 m/s after a second, a rider who brakes or turns,
+    speed has changed by 0.46 m/s, as walkers' do, m/s^2"""
+    acceleration_cyclist_mps2: Annotated[float, Meta(gt=0, le=50)] = 5.0
+    """the same of cyclists and vehicles: 0.91 m/s after a second, a rider who brakes or turns,
     m/s^2"""
-    first_speed_pedestrian_mps: Annotated[float, Meta(gt=0, le=50)] = 1.5
+    first_speed_pedestrian_mps: Annotated[float, Meta(gt=0, le=50)] = 2.0
     """standard deviation of the velocity of a new track: a walker's. Steps that need a higher speed
     are believed only when several agree, m/s"""
-    first_speed_cyclist_mps: Annotated[float, Meta(gt=0, le=50)] = 5.0
+    first_speed_cyclist_mps: Annotated[float, Meta(gt=0, le=50)] = 6.0
     """the same of cyclists and vehicles, m/s"""
     speed_window_frames: Annotated[int, Meta(ge=1, le=60)] = 4
     """speed and velocity are the displacement over these nominal frames: a cyclist's in the

@@ -24,9 +24,9 @@ class MotionNoise:
     believed.
     """
 
-    measured_m: tuple[float, float, float] = (0.08, 0.10, 0.10)
-    acceleration_mps2: tuple[float, float, float] = (3.0, 6.0, 6.0)
-    first_speed_mps: tuple[float, float, float] = (1.5, 5.0, 5.0)
+    measured_m: tuple[float, float, float] = (0.10, 0.12, 0.12)
+    acceleration_mps2: tuple[float, float, float] = (2.5, 5.0, 5.0)
+    first_speed_mps: tuple[float, float, float] = (2.0, 6.0, 6.0)
 
     def noise(self, frame_s: float) -> FloatArray:
         """[kinds, 2]: variance of a detection's place, m^2, and what a second of acceleration adds
