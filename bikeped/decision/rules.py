@@ -93,7 +93,9 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
     cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist], pairs.pedestrian_row
     c_now, p_now = rows.xy_m[cyclist], rows.xy_m[pedestrian]
     distance = _length(c_now - p_now)
-    speed = _speed(rows, pairs.cyclist_row, settings.speed_window_s)[pairs.cyclist]
+    window_s = settings.speed_window_s
+    least_s = EPSILON_S if settings.count_all else window_s
+    speed = _speed(rows, pairs.cyclist_row, window_s, least_s)[pairs.cyclist]
     d_max = np.full(len(pairs), settings.d_max_m)
     if settings.speed_adaptive:
         d_max = np.maximum(
@@ -170,13 +172,16 @@ def _positions_before(
     return c_past, p_past, now - old_s
 
 
-def _speed(rows: TrackRows, row: IndexArray, window_s: float) -> FloatArray:
-    """Speeds [n] (m/s) over the last `window_s`, or over the track's life where it is shorter."""
+def _speed(rows: TrackRows, row: IndexArray, window_s: float, least_s: float) -> FloatArray:
+    """Speeds [n] (m/s): the displacement in the last `window_s`, over its time or `least_s`.
+
+    A track younger than `least_s` seems slower than it is: one step, which may be a wrong match, is
+    not believed to be its speed.
+    """
     now = rows.time_s[row]
     old = _walk_back(rows, now - (window_s - EPSILON_S), row)[0][0]
-    elapsed = now - rows.time_s[old]
     displacement = _length(rows.xy_m[row] - rows.xy_m[old])
-    return np.where(elapsed > 0, displacement / np.maximum(elapsed, EPSILON_S), 0.0)
+    return np.asarray(displacement / np.maximum(now - rows.time_s[old], least_s))
 
 
 def _walk_back(

@@ -18,8 +18,9 @@ class Tracker:
     """`update(points, time_s)` once a frame gives the tracks.
 
     The velocity reported is the displacement over `speed_window_s` (paper: positions 4 frames apart
-    over the elapsed time), or over the track's life while it is shorter; the smoothed
-    velocity that coasting and prediction use is that of `batch`.
+    over the elapsed time), of a younger track over that window all the same, for its first step may
+    be a wrong match; the filter's velocity, which coasting, prediction and rules use, is that of
+    `batch`.
     """
 
     def __init__(
@@ -79,8 +80,8 @@ class Tracker:
             for past_s, px, py in reversed(path):  # noqa: B007 - used below
                 if past_s <= target:
                     break
-            elapsed = time_s - past_s
-            velocity.append(((x - px) / elapsed, (y - py) / elapsed) if elapsed > 0 else (0.0, 0.0))
+            elapsed = max(time_s - past_s, self._speed_window_s)
+            velocity.append(((x - px) / elapsed, (y - py) / elapsed))
             path.append((time_s, x, y))
             self._paths[key] = path
         return np.asarray(velocity, np.float64).reshape(-1, 2)

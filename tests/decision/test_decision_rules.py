@@ -264,8 +264,8 @@ def test_a_pair_is_as_old_as_its_younger_half():
     decisions = run(replace(SELECTED, lookback_s=4 / 30), frames)
     assert [d.state for d in decisions[:4]] == [State.IDLE] * 3 + [State.WARNING]
     assert [d.pair.lookback_s for d in decisions[3:]] == pytest.approx([0, 1 / 30, 2 / 30])
-    # but the cyclist's speed is its own, over its own positions
-    assert decisions[3].pair.speed_mps == pytest.approx(6.0)
+    # but the cyclist's speed is its own, of its three steps so far, over four frames
+    assert decisions[3].pair.speed_mps == pytest.approx(4.5)
 
 
 def test_a_track_that_was_away_begins_anew():

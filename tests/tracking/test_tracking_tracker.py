@@ -38,8 +38,7 @@ def test_velocity_is_the_displacement_over_four_frames():
     ys = [0.0, 0.1, 0.3, 0.2, 0.5, 0.9, 1.0]
     for i, y in enumerate(ys):
         tracks = tracker.update(points((0, 5, y, 0)), i / 30)
-        back = min(i, 4)  # over its life while it is younger
-        expected = (y - ys[i - back]) / (back / 30) if back else 0.0
+        expected = (y - ys[max(i - 4, 0)]) / (4 / 30)  # and of a younger track: not yet believed
         assert tracks.velocity_mps[0] == pytest.approx((0, expected), abs=1e-9)
 
 

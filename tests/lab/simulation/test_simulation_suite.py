@@ -164,8 +164,7 @@ def fires(seen, config, f, c, p, k):
     d = math.dist(now_c, now_p)
     d_max = config.d_max_m
     if config.speed_adaptive and f > born:
-        old = max(f - 3, born)
-        v = math.dist(now_c, at(old, c)) / ((f - old) / 30)
+        v = math.dist(now_c, at(max(f - 4, born), c)) / (4 / 30)
         d_max = max(d_max, v * 0.84 + v * v / (2 * 1.96))
     if then == f or not config.d_min_m <= d <= d_max:
         return False
