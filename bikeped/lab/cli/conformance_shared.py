@@ -42,7 +42,8 @@ def scenarios_option(command: F) -> F:
         "scenarios_dir",
         type=click.Path(path_type=Path),
         metavar="DIR",
-        help="Folder of scenario files (*.yaml) in place of the bundled 24.",
+        help="Folder of scenario files (*.yaml) in place of the bundled 24, or `street`: bundled "
+        "scenes of an ordinary street.",
     )(command)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ SIZES_M: dict[str, tuple[float, float, float]] = {
 HAZARDS = ("safe", "standard", "high-speed", "accessibility", "multi-agent", "edge", "non-linear")
 #: A scenario continues for this long after the last waypoint (definitions, section 4).
 TAIL_S = 0.5
+_SCENARIO_KEYS = {"name", "hazard", "expected", "vehicle", "agents", "story", "duration_s"}
 _SIZE_KEYS = ("length", "width", "height")
 _MAX_BYTES = 1_000_000
 _MAX_DURATION_S = 3600.0
@@ -37,12 +38,16 @@ _MAX_AGENTS = 1000
 
 @dataclass(frozen=True)
 class Agent:
-    """One road user: `path` [n, 3] holds t (s), x, y (m); times strictly increase."""
+    """One road user: `path` [n, 3] holds t (s), x, y (m); times strictly increase.
+
+    In the spans `hidden` (from, until, s) something stands in the camera's way.
+    """
 
     id: int
     kind: str
     path: FloatArray
     size_m: tuple[float, float, float]
+    hidden: tuple[tuple[float, float], ...] = ()
 
     @property
     def start_s(self) -> float:
@@ -72,6 +77,13 @@ class Agent:
         heading = self._headings()[segment]
         return (np.where(present[:, None], xy, np.nan), np.where(present, heading, np.nan), present)
 
+    def in_sight(self, t: FloatArray) -> BoolArray:
+        """At which of the times [n] nothing hides the agent."""
+        found: BoolArray = np.ones(len(t), np.bool_)
+        for begin, end in self.hidden:
+            found &= (t < begin - 1e-9) | (t > end + 1e-9)
+        return found
+
     def _headings(self) -> FloatArray:
         step = np.diff(self.path[:, 1:], axis=0)
         moving = np.hypot(step[:, 0], step[:, 1]) > 1e-9
@@ -95,11 +107,13 @@ class Scenario:
     agents: tuple[Agent, ...]
     story: str = ""
     source: str = ""
+    length_s: float | None = None
 
     @property
     def duration_s(self) -> float:
-        """Time of the last frame's bound: the last waypoint plus half a second."""
-        return max(agent.end_s for agent in self.agents) + TAIL_S
+        """Time of the last frame's bound: `length_s`, or the last waypoint plus half a second."""
+        last_s = max(agent.end_s for agent in self.agents)
+        return last_s + TAIL_S if self.length_s is None else self.length_s
 
     def frame_times(self, fps: float = 30.0) -> FloatArray:
         """Times i / fps that are at most `duration_s` (tolerating the last bit)."""
@@ -120,7 +134,12 @@ def load_scenario(path: Path) -> Scenario:
 
 
 def load_scenarios(folder: Path) -> list[Scenario]:
-    """All `*.yaml` and `*.yml` of a folder in file-name order, names unique."""
+    """All `*.yaml` and `*.yml` of a folder in file-name order, names unique.
+
+    `street`, where there is no such folder, are the bundled scenes of an ordinary street.
+    """
+    if folder == Path("street") and not folder.exists():
+        folder = Path(__file__).parent / "street"
     if not folder.is_dir():
         raise ScenarioError(f"{folder}: is not a folder of scenario files; check --scenarios")
     files = sorted(p for p in folder.iterdir() if p.suffix in {".yaml", ".yml"})
@@ -151,7 +170,7 @@ def parse_scenario(text: str, source: str) -> Scenario:
     except ValueError as error:
         raise ScenarioError(f"{at}{error}; correct it there") from error
     top = _mapping(data, f"{at}scenario")
-    _check_keys(top, {"name", "hazard", "expected", "vehicle", "agents", "story"}, at)
+    _check_keys(top, _SCENARIO_KEYS, at)
     name = top.get("name")
     if not isinstance(name, str) or not name.strip():
         raise ScenarioError(f"{at}name: expected a text; write name: My Scenario")
@@ -172,7 +191,20 @@ def parse_scenario(text: str, source: str) -> Scenario:
         agents=agents,
         story=" ".join(str(top.get("story", "")).split()),
         source=source,
+        length_s=_length_s(top.get("duration_s"), agents, at),
     )
+
+
+def _length_s(value: object, agents: Sequence[Agent], at: str) -> float | None:
+    if value is None:
+        return None
+    length_s, last_s = _number(value, f"{at}duration_s"), max(agent.end_s for agent in agents)
+    if not last_s <= length_s <= _MAX_DURATION_S:
+        raise ScenarioError(
+            f"{at}duration_s: {length_s:g} s is not from the last waypoint's {last_s:g} s to "
+            f"{_MAX_DURATION_S:g} s"
+        )
+    return length_s
 
 
 def dump_scenario(scenario: Scenario) -> str:
@@ -185,6 +217,8 @@ def dump_scenario(scenario: Scenario) -> str:
     ]
     if scenario.story:
         lines.append(f"story: {_quoted(scenario.story)}")
+    if scenario.length_s is not None:
+        lines.append(f"duration_s: {_yaml_number(scenario.length_s)}")
     lines.append("agents:")
     for agent in scenario.agents:
         path = ", ".join("[" + ", ".join(map(_yaml_number, p)) + "]" for p in agent.path)
@@ -192,7 +226,9 @@ def dump_scenario(scenario: Scenario) -> str:
         if agent.size_m != SIZES_M[agent.kind]:
             length, width, height = map(_yaml_number, agent.size_m)
             size = f", size: {{length: {length}, width: {width}, height: {height}}}"
-        lines.append(f"  - {{id: {agent.id}, kind: {agent.kind}{size}, path: [{path}]}}")
+        spans = ", ".join("[" + ", ".join(map(_yaml_number, span)) + "]" for span in agent.hidden)
+        hidden = f", hidden: [{spans}]" if spans else ""
+        lines.append(f"  - {{id: {agent.id}, kind: {agent.kind}{size}{hidden}, path: [{path}]}}")
     return "\n".join(lines) + "\n"
 
 
@@ -244,10 +280,25 @@ def _agent(item: object, file: str, index: int) -> Agent:
     if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**31:
         raise ScenarioError(f"{file}agents[{index}]: id: expected a whole number from 0")
     at = f"{file}agent {number}: "
-    _check_keys(data, {"id", "kind", "path", "size", "note"}, at)
+    _check_keys(data, {"id", "kind", "path", "size", "note", "hidden"}, at)
     kind = _choice(data.get("kind"), tuple(SIZES_M), f"{at}kind")
     path = _path(data.get("path"), f"{at}path")
-    return Agent(number, kind, path, _size(data.get("size"), kind, f"{at}size"))
+    size = _size(data.get("size"), kind, f"{at}size")
+    return Agent(number, kind, path, size, _hidden(data.get("hidden", []), f"{at}hidden"))
+
+
+def _hidden(spans: object, at: str) -> tuple[tuple[float, float], ...]:
+    if not isinstance(spans, list):
+        raise ScenarioError(f"{at}: expected a list of [from, until] in seconds")
+    found = []
+    for i, span in enumerate(spans):
+        if not isinstance(span, list) or len(span) != 2:
+            raise ScenarioError(f"{at}[{i}]: expected [from, until] in seconds")
+        begin, end = (_number(value, f"{at}[{i}]") for value in span)
+        if not begin < end:
+            raise ScenarioError(f"{at}[{i}]: {end:g} s is not after {begin:g} s; swap them")
+        found.append((begin, end))
+    return tuple(found)
 
 
 def _path(points: object, at: str) -> FloatArray:

@@ -110,6 +110,7 @@ def simulate_perception(
     present = np.zeros((frames, agents), np.bool_)
     for index, agent in enumerate(scenario.agents):
         xy, heading, there = agent.sample(time_s)
+        there &= agent.in_sight(time_s)
         if reach_m is not None:
             there &= CameraView(pose, reach_m).sees(xy)
         ground = np.where(there[:, None], pose.world_to_ground(xy), np.nan)

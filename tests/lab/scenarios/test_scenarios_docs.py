@@ -13,6 +13,7 @@ from bikeped.lab.simulation.truth import compute_ground_truth
 
 PAGE = Path(__file__).parents[3] / "docs" / "scenarios.md"
 FOLDER = "../bikeped/lab/scenarios/bundled"
+STREET_FOLDER = "../bikeped/lab/scenarios/street"
 INTRO = """\
 # The 24 scenarios
 
@@ -32,33 +33,50 @@ actionable ones leave a distracted pedestrian time to react (TTC of at least 1.8
 Occluded Emergence are over too soon for any warning. `--scenarios DIR` on every conformance command
 runs your own files instead.
 """
-SWERVE = """
+STREET = """\
+## An ordinary street
+
+`--scenarios street` runs these instead, from
+[bikeped/lab/scenarios/street](../bikeped/lab/scenarios/street): what recorded traffic is full of
+and the 24 lack. In most of them nothing happens, and a light that is red then is what people stop
+believing. An agent may be `hidden` in spans of time (something stands in the camera's way), and
+`duration_s` lets a scenario run on after the last waypoint, so that what a tracker makes of
+somebody it has lost is seen.
+
+"""
+SWERVE = """\
 **Swerving Cyclist** shows a limit of the rule, on purpose: while the cyclist cuts in, the way
 gained ahead hides the way lost to the side, the distance stops shrinking, and the alert of the
 swerve begins at the closest approach, with no time left.
 """
 
 
-def page(scenarios):
+def page(scenarios, street):
     truths = {s.name: compute_ground_truth(s) for s in scenarios}
+    intro = INTRO.format(
+        folder=FOLDER,
+        count=len(scenarios),
+        danger=sum(t.danger.any() for t in truths.values()),
+        actionable=sum(t.actionable.any() for t in truths.values()),
+    )
+    return "\n".join(
+        [intro, table(scenarios, FOLDER), SWERVE, STREET + table(street, STREET_FOLDER)]
+    )
+
+
+def table(scenarios, folder):
     lines = [
-        INTRO.format(
-            folder=FOLDER,
-            count=len(scenarios),
-            danger=sum(t.danger.any() for t in truths.values()),
-            actionable=sum(t.actionable.any() for t in truths.values()),
-        ),
         "| scenario | hazard | story | seconds | agents | danger frames | actionable |",
         "| --- | --- | --- | ---: | --- | ---: | ---: |",
     ]
     for s in sorted(scenarios, key=lambda s: (HAZARDS.index(s.hazard), s.name)):
-        truth = truths[s.name]
+        truth = compute_ground_truth(s)
         seconds = len(truth.time_s) / FPS
         lines.append(
-            f"| [{s.name}]({FOLDER}/{Path(s.source).name}) | {s.hazard} | {s.story} | "
+            f"| [{s.name}]({folder}/{Path(s.source).name}) | {s.hazard} | {s.story} | "
             f"{seconds:.1f} | {agents(s)} | {truth.danger.sum()} | {truth.actionable.sum()} |"
         )
-    return "\n".join(lines) + "\n" + SWERVE
+    return "\n".join(lines) + "\n"
 
 
 def agents(scenario):
@@ -69,9 +87,12 @@ def agents(scenario):
 
 def test_the_page_is_current(suite):
     remedy = "run: python tests/lab/scenarios/test_scenarios_docs.py"
-    assert PAGE.read_text(encoding="utf-8") == page(suite.scenarios), remedy
+    assert PAGE.read_text(encoding="utf-8") == page(
+        suite.scenarios, load_scenarios(Path("street"))
+    ), remedy
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(load_scenarios(bundled_folder())), encoding="utf-8")
+    both = load_scenarios(bundled_folder()), load_scenarios(Path("street"))
+    PAGE.write_text(page(*both), encoding="utf-8")
     sys.stdout.write(f"{PAGE}\n")
