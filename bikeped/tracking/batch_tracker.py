@@ -242,31 +242,30 @@ class BatchTracker:
         place = scene * xy_m.shape[1] + matched.ravel()[flat]
         new_xy = xy_m.reshape(-1, 2)[place]
         elapsed = np.maximum(time_s - seen_s[flat], _EPSILON_S)
-        old_v = velocity[flat]
+        old_v, kinds = velocity[flat], self.kind.reshape(-1)[flat]
+        weight = self.settings.velocity_weight
         if self.settings.motion is None:
-            weight = self.settings.velocity_weight
-        else:
-            weight = _ACCELERATION_WEIGHT
-        kept = ((1 - weight) ** (elapsed / self.settings.frame_s))[:, None]
-        if self.settings.motion is None:
+            kept = self._kept(weight, elapsed)
             new_v = old_v * kept + (new_xy - seen_xy[flat]) / elapsed[:, None] * (1 - kept)
         else:
+            weight = _ACCELERATION_WEIGHT
             new_xy, new_v, covariance[flat] = correct(
                 self.xy_m.reshape(-1, 2)[flat],
                 old_v,
                 covariance[flat],
                 new_xy,
                 elapsed,
-                self._motion[0][self.kind.ravel()[flat]],
+                self._motion[0][kinds],
             )
         if self._gated:
-            limit = self._max_speed[self.kind.ravel()[flat]]
+            limit = self._max_speed[kinds]
             over = (new_v * new_v).sum(1) > limit * limit
             if np.count_nonzero(over):
                 speed = np.hypot(new_v[over, 0], new_v[over, 1])
                 new_v[over] *= (limit[over] / speed)[:, None]
         velocity[flat] = new_v
         if self.settings.acceleration:
+            kept = self._kept(weight, elapsed)
             raw_a = (new_v - old_v) / elapsed[:, None]
             acceleration[flat] = acceleration[flat] * kept + raw_a * (1 - kept)
         self.xy_m.reshape(-1, 2)[flat] = new_xy
@@ -281,6 +280,10 @@ class BatchTracker:
         hits[flat] += 1
         if self.settings.rider_radius_m > 0:
             self._update_kind(flat, cycle.ravel()[place])
+
+    def _kept(self, weight: float, elapsed_s: FloatArray) -> FloatArray:
+        """[n, 1]: what is kept of a mean whose newest value has `weight` each nominal frame."""
+        return np.asarray((1 - weight) ** (elapsed_s / self.settings.frame_s))[:, None]
 
     def _find_parked(
         self, time_s: float, xy_m: FloatArray, kind: KindArray, ridden: BoolArray | None

@@ -70,6 +70,9 @@ def correct(
     place, mixed, speed = predict_covariance(covariance, elapsed_s, noise)
     total = place + noise[:, 0]
     gain, speed_gain = place / total, mixed / total
-    after = np.stack([gain * noise[:, 0], speed_gain * noise[:, 0], speed - speed_gain * mixed], 1)
+    after = np.empty_like(covariance)
+    after[:, 0] = gain * noise[:, 0]
+    after[:, 1] = speed_gain * noise[:, 0]
+    after[:, 2] = speed - speed_gain * mixed
     missed = measured_m - xy_m
     return xy_m + gain[:, None] * missed, velocity_mps + speed_gain[:, None] * missed, after

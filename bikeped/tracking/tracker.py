@@ -72,19 +72,20 @@ class Tracker:
     def _window_velocity(self, ids: list[int], xy: FloatArray, time_s: float) -> FloatArray:
         known = self._paths
         self._paths = {}
-        velocity = []
+        past = []
         target = time_s - self._speed_window_s + _EPSILON_S
         for key, (x, y) in zip(ids, xy.tolist(), strict=True):
             path = known.get(key) or deque(maxlen=self._history_length)
-            past_s, px, py = time_s, x, y
-            for past_s, px, py in reversed(path):  # noqa: B007 - used below
-                if past_s <= target:
+            then = now = (time_s, x, y)
+            for then in reversed(path):
+                if then[0] <= target:
                     break
-            elapsed = max(time_s - past_s, self._speed_window_s)
-            velocity.append(((x - px) / elapsed, (y - py) / elapsed))
-            path.append((time_s, x, y))
+            past.append(then)
+            path.append(now)
             self._paths[key] = path
-        return np.asarray(velocity, np.float64).reshape(-1, 2)
+        before = np.asarray(past, np.float64).reshape(-1, 3)
+        elapsed_s = np.maximum(time_s - before[:, :1], self._speed_window_s)
+        return np.asarray((xy - before[:, 1:]) / elapsed_s)
 
 
 def predict(

@@ -371,7 +371,7 @@ def test_lanes_together_equal_each_alone(settings):
             a, b = together.alive[scene, :slots], single.alive[0]
             assert (a == b).all()
             for name in ("id", "kind", "xy_m", "velocity_mps", "acceleration_mps2", "seen_s",
-                         "hits", "detection"):  # fmt: skip
+                         "covariance", "hits", "detection"):  # fmt: skip
                 left, right = getattr(together, name)[scene, :slots], getattr(single, name)[0]
                 assert (left[a] == right[b]).all(), (frame, scene, name)
     assert together.id.max() > 12
