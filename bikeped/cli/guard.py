@@ -22,7 +22,7 @@ _INPUTS = (
 )
 _OUTPUTS = (
     *("json_path", "overlay", "events", "audit_path", "out", "figure", "curve_out", "engine"),
-    *("report_path", "board_path", "grid_path"),
+    *("report_path", "board_path", "grid_path", "html_path"),
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +62,14 @@ def encounters(seed: int, count: int, out: Path) -> None:
     help="Localisation error and missed detections by size, alone or in bursts; or neither.",
 )
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option(
+    "--html",
+    "html_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write a page in one file with every alert to step through, nuisance first: of the "
+    "first --rule, or of the configured decision.",
+)
 @json_option
 @guarded
 def traffic(
@@ -70,6 +79,7 @@ def traffic(
     rules: tuple[str, ...],
     noise: Noise,
     seed: int,
+    html_path: Path | None,
     json_path: str | None,
 ) -> None:
     """Real or recorded trajectories through tracker and rules: nuisance, misses, by scene.
@@ -79,14 +89,13 @@ def traffic(
     """
     from bikeped.lab.simulation.suite import CONFIGURATIONS
     from bikeped.lab.traffic.readers import read_traffic
-    from bikeped.lab.traffic.result import traffic_result
+    from bikeped.lab.traffic.result import traffic_result, with_alert_settings
     from bikeped.lab.traffic.suite import TrafficSuite
 
     run = SuiteRun(config_path, overrides, None, json_path, seed)
     known = {**CONFIGURATIONS, "configured": run.decision}
-    if not rules and run.decision in CONFIGURATIONS.values():
-        known.pop("configured")
-    chosen = {name: known[name] for name in rules or known if name in known}
+    every = [n for n in known if n != "configured" or run.decision not in CONFIGURATIONS.values()]
+    chosen = {name: known[name] for name in rules or every if name in known}
     for name in rules:
         if name not in chosen:
             near = difflib.get_close_matches(name, known, 1)
@@ -95,6 +104,14 @@ def traffic(
     suite = TrafficSuite.load(read_traffic(traffic), run.loaded, noise, seed)
     with progress_bar("rules", len(chosen) + 1) as progress:
         result = traffic_result(suite, chosen, run.loaded, progress)
+    if html_path is not None:
+        from bikeped.lab.testbench.traffic_page import render_traffic_page
+
+        name = rules[0] if rules else "configured"
+        shown = with_alert_settings(known[name], run.decision)
+        words = f"bikeped conformance traffic {shlex.quote(str(traffic))} --noise {noise}"
+        words += "".join(f" --rule {rule}" for rule in rules) + f" --seed {seed}"
+        write_whole(html_path, render_traffic_page(suite, name, shown, result, words))
     if json_path is not None:
         run.write_json(result.data)
     if json_path != "-":

@@ -40,7 +40,7 @@ from bikeped.lab.testbench.settings import settings_in_force
 from bikeped.templates import render
 from bikeped.web.server import WEB_FOLDER
 
-_FOLDERS = (Path(__file__).parent, WEB_FOLDER)  #: with `static/` and `templates/`, own ones first
+FOLDERS = (Path(__file__).parent, WEB_FOLDER)  #: with `static/` and `templates/`, own ones first
 #: In the order of their imports.
 _SCRIPTS = (
     "ui.js",
@@ -88,7 +88,7 @@ def render_report(
 
 def _static(name: str) -> str:
     """A script or style sheet of the test bench, or one that all pages share."""
-    files = (folder / "static" / name for folder in _FOLDERS)
+    files = (folder / "static" / name for folder in FOLDERS)
     return next(file for file in files if file.is_file()).read_text(encoding="utf-8")
 
 
@@ -142,20 +142,14 @@ def _page(
         "calibration_hash": str(loaded.calibration_hash),
         "command": command,
     }
-    style = "\n".join(map(_static, _STYLES))
-    theme = _static("theme.js")
-    script = bundle({name: _static(name) for name in _SCRIPTS})
-    policy = (
-        "default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; "
-        f"style-src {_hash(style)}; script-src {_hash(theme)} {_hash(script)}"
-    )
+    style, theme, script = inline_files(_STYLES, _SCRIPTS)
     # "<" could end the script element; \\u003c is the same JSON.
     data_json = msgspec.json.encode(data).decode().replace("<", "\\u003c")
     return render(
         "report.html",
-        *(folder / "templates" for folder in _FOLDERS),
+        *(folder / "templates" for folder in FOLDERS),
         version=__version__,
-        policy=policy,
+        policy=page_policy(style, theme, script),
         style=Markup(style),
         theme=Markup(theme),
         script=Markup(script),
@@ -167,6 +161,20 @@ def _page(
         provenance=definitions_html(provenance),
         command=command,
         decision=json.dumps(msgspec.to_builtins(loaded.config.decision)),
+    )
+
+
+def inline_files(styles: Sequence[str], scripts: Sequence[str]) -> tuple[str, str, str]:
+    """The style sheets, the script of the theme, and the scripts in one, for a page in one file."""
+    style = "\n".join(map(_static, styles))
+    return style, _static("theme.js"), bundle({name: _static(name) for name in scripts})
+
+
+def page_policy(style: str, theme: str, script: str) -> str:
+    """A content security policy that allows these inline texts, and nothing else."""
+    return (
+        "default-src 'none'; img-src data:; base-uri 'none'; form-action 'none'; "
+        f"style-src {_hash(style)}; script-src {_hash(theme)} {_hash(script)}"
     )
 
 
