@@ -89,7 +89,7 @@ def traffic(
     """
     from bikeped.lab.simulation.suite import CONFIGURATIONS
     from bikeped.lab.traffic.readers import read_traffic
-    from bikeped.lab.traffic.result import traffic_result, with_alert_settings
+    from bikeped.lab.traffic.result import FORESIGHT, traffic_result, with_alert_settings
     from bikeped.lab.traffic.suite import TrafficSuite
 
     run = SuiteRun(config_path, overrides, None, json_path, seed)
@@ -97,7 +97,7 @@ def traffic(
     every = [n for n in known if n != "configured" or run.decision not in CONFIGURATIONS.values()]
     chosen = {name: known[name] for name in rules or every if name in known}
     for name in rules:
-        if name not in chosen:
+        if name not in (*chosen, FORESIGHT):
             near = difflib.get_close_matches(name, known, 1)
             remedy = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
             raise BikepedError(f"--rule {name}: there is no such configuration; {remedy}")
@@ -107,7 +107,7 @@ def traffic(
     if html_path is not None:
         from bikeped.lab.testbench.traffic_page import render_traffic_page
 
-        name = rules[0] if rules else "configured"
+        name = next(iter(chosen)) if rules and chosen else "configured"
         shown = with_alert_settings(known[name], run.decision)
         words = f"bikeped conformance traffic {shlex.quote(str(traffic))} --noise {noise}"
         words += "".join(f" --rule {rule}" for rule in rules) + f" --seed {seed}"

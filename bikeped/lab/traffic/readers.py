@@ -32,6 +32,8 @@ POLES = "poles.json"
 _SUFFIXES = (".csv", ".csv.gz", ".xml", ".xml.gz")
 _POLE_KEYS = ("x_m", "y_m", "heading_deg")
 _MOST_BYTES, _MOST_TEXT = 200_000_000, 1_000_000_000
+#: A scene's length times its road users, seconds: some gigabytes while it is evaluated.
+_MOST_SECONDS = 2e6
 #: Kinds by what the name of a SUMO vehicle type contains; any other vehicle is a car.
 _SUMO_KINDS = {
     **dict.fromkeys(("bike", "bicycle", "cycl", "scooter"), "cyclist"),
@@ -98,7 +100,7 @@ def read_traffic(folder: Path) -> tuple[TrafficScene, ...]:
 
 
 def read_scene(path: Path) -> Scenario:
-    """The road users of one recording."""
+    """The road users of one recording, from its first moment on."""
     rows = _xml_points(path) if ".xml" in path.suffixes else _csv_points(path)
     points: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     kinds: dict[str, str] = {}
@@ -106,17 +108,24 @@ def read_scene(path: Path) -> Scenario:
         if kinds.setdefault(who, kind) != kind:
             raise ScenarioError(f"{path}: id {who}: is {kinds[who]} and {kind}; give each one kind")
         points.setdefault((who, kind), []).append((t, x, y))
+    first_s = min((t for found in points.values() for t, _, _ in found), default=0.0)
     agents = []
     for number, ((who, kind), found) in enumerate(points.items(), 1):
-        track = np.asarray(sorted(found))
+        track = np.asarray(sorted(found)) - [first_s, 0.0, 0.0]
         if (np.diff(track[:, 0]) <= 0).any():
-            at = float(track[1:][np.diff(track[:, 0]) <= 0][0, 0])
+            at = first_s + float(track[1:][np.diff(track[:, 0]) <= 0][0, 0])
             raise ScenarioError(f"{path}: id {who}: is in two places at {at:g} s; keep one")
         if len(track) > 1:  # who is seen once has no path
             agents.append(RecordedAgent(number, kind, track, SIZES_M[kind]))
     if not agents:
         raise ScenarioError(f"{path}: holds nobody with two positions; check the recording")
-    return Scenario(_scene(path), "standard", "warning", "bicycle", tuple(agents), "", str(path))
+    scene = Scenario(_scene(path), "standard", "warning", "bicycle", tuple(agents), "", str(path))
+    if scene.duration_s * len(agents) > _MOST_SECONDS:
+        raise ScenarioError(
+            f"{path}: {scene.duration_s:.0f} s of {len(agents)} road users are too much at once; "
+            "cut it into shorter scenes"
+        )
+    return scene
 
 
 def _scene(path: Path) -> str:
@@ -129,7 +138,7 @@ def _text(path: Path) -> str:
         if path.suffix == ".gz":
             with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
                 data = file.read(_MOST_TEXT)
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path}: is not UTF-8 text; save it as UTF-8") from error
     except (OSError, EOFError, zlib.error) as error:

@@ -75,7 +75,7 @@ def test_traffic_gives_the_documented_json(street, capsys):
 
 
 def test_traffic_prints_chosen_rules(street, capsys):
-    words = ["--rule", "ttc", "--rule", "configured", "--noise", "none"]
+    words = ["--rule", "ttc", "--rule", "configured", "--rule", "foresight", "--noise", "none"]
     words += ["--set", "decision.alert_hold_s=0.5"]
     assert main(["conformance", "traffic", str(street), "-c", CONFIG, *words]) == 0
     said = capsys.readouterr().out

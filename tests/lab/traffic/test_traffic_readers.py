@@ -42,6 +42,13 @@ def test_rows_in_any_order_and_columns_in_any_order(tmp_path):
     np.testing.assert_array_equal(a, b)
 
 
+def test_a_recording_begins_with_its_first_moment(tmp_path):
+    """As of SUMO with --begin, here from a spreadsheet, whose text begins with a mark."""
+    late = "\ufeff" + HEADER + "25200,1,pedestrian,0,0\n25201,1,pedestrian,1,0\n"
+    (tmp_path / "a.csv").write_text(late, encoding="utf-8")
+    assert read_scene(tmp_path / "a.csv").agents[0].path.tolist() == [[0, 0, 0], [1, 1, 0]]
+
+
 def test_a_heading_is_not_the_noise_of_one_who_stands(tmp_path):
     """Rides north, then stands for 5 s while the recording jitters by a centimetre."""
     t = np.arange(100) / 10
@@ -70,6 +77,8 @@ def test_a_heading_is_not_the_noise_of_one_who_stands(tmp_path):
         ("a.csv", HEADER + WALK + "-1,1,pedestrian,0,0\n", "line 4: time_s: '-1'"),
         ("a.csv", HEADER + WALK + "1,1,pedestrian,2,0\n", "id 1: is in two places at 1 s"),
         ("a.csv", HEADER + WALK + "2,1,cyclist,2,0\n", "id 1: is pedestrian and cyclist"),
+        ("a.csv", HEADER + WALK + "9e5,2,pedestrian,2,0\n9.9e5,2,pedestrian,2,0\n3e5,3,car,0,0\n"
+         "4e5,3,car,0,0\n", "are too much at once"),
         ("a.csv", b"\xff\xfe", "is not UTF-8"),
         ("a.csv.gz", b"no gzip", "cannot be read"),
         ("a.csv.gz", gzip.compress(b"time_s" * 99)[:-9], "cannot be read"),
