@@ -151,8 +151,13 @@ def script(scenario: Scenario) -> dict[str, Any]:
         if agent.size_m != SIZES_M[agent.kind]:
             size = zip(("length", "width", "height"), agent.size_m, strict=True)
             agents[-1]["size"] = dict(size)
+        if agent.hidden:
+            agents[-1]["hidden"] = [list(span) for span in agent.hidden]
     keys = ("name", "hazard", "expected", "vehicle", "story")
-    return {**{key: getattr(scenario, key) for key in keys}, "agents": agents}
+    held: dict[str, Any] = {key: getattr(scenario, key) for key in keys}
+    if scenario.length_s is not None:
+        held["duration_s"] = scenario.length_s
+    return {**held, "agents": agents}
 
 
 def page_description(work: BenchRunner, named: dict[str, DecisionConfig]) -> dict[str, Any]:

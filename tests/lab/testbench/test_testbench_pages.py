@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -21,8 +22,10 @@ from bikeped.lab.experiments.trials import (
     sorted_suite,
     summarize_metrics,
 )
+from bikeped.lab.scenarios.scenario import dump_scenario, load_scenarios, parse_scenario
 from bikeped.lab.simulation.perception import RecallModel
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
+from bikeped.lab.testbench.pages import script
 from bikeped.lab.testbench.playback import TESTS, coverage, playback
 from bikeped.lab.testbench.runner import BenchRunner, trial_summaries
 from bikeped.lab.testbench.settings import Pose
@@ -232,3 +235,10 @@ def test_what_was_kept_is_not_mistaken_for_something_else(work):
     assert [figures(warm, one) for one in asked] == fresh
     assert [figures(warm, one) for one in reversed(asked)] == fresh[::-1]
     assert len(set(fresh)) == len(asked)
+
+
+@pytest.mark.parametrize("scenarios", [SCENARIOS, load_scenarios(Path("street"))])
+def test_the_editor_holds_all_of_a_scenario(scenarios):
+    for scenario in scenarios:
+        again = parse_scenario(json.dumps(script(scenario)), scenario.source)
+        assert dump_scenario(again) == dump_scenario(scenario)
