@@ -8,6 +8,7 @@ ground below the lens). Arrays are parallel; constructors raise ValueError for a
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -206,6 +207,10 @@ class PairMetrics:
     speed_mps: float  #: of the cyclist
     d_min_m: float
     d_max_m: float  #: at least the stopping distance where `decision.speed_adaptive` is on
+    closing_mps: float = 0.0  #: how fast the distance shrinks, by the filter's velocities
+    pass_m: float = 0.0  #: least distance within the next 5 s, if both go on as now
+    pass_s: float = 0.0  #: when
+    contact_s: float = math.inf  #: until contact at this closing speed
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import math
 from bikeped.config.lens_check import Calibration
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig, TrackingConfig
+from bikeped.decision.predictive import PredictiveSettings
 from bikeped.decision.rules import RuleSettings
 from bikeped.decision.shown import ShownSettings
 from bikeped.errors import ConfigError, GeometryError
@@ -43,6 +44,15 @@ def rule_settings(decision: DecisionConfig, speed_window_frames: int = 4) -> Rul
         speed_window_s=speed_window_frames / fps,
         ttc_s=decision.ttc_s,
         max_unseen_s=decision.max_unseen_s,
+        predictive=PredictiveSettings(
+            least_closing_mps=decision.least_closing_mps,
+            least_cycling_mps=decision.least_cycling_mps,
+            pass_within_m=decision.pass_within_m,
+            pass_growth_mps=decision.pass_growth_mps,
+            stopping_share=decision.stopping_share,
+            contact_within_s=decision.contact_within_s,
+            stay_margin=decision.stay_margin,
+        ),
         shown=ShownSettings(
             on_frames=decision.alert_on_frames,
             window_s=(decision.alert_window_frames - 0.5) / fps,

@@ -207,8 +207,9 @@ class TrackingConfig(Section, frozen=True):
 class DecisionConfig(Section, frozen=True):
     """The three-stage rule. The defaults are the paper's selected configuration."""
 
-    rule: Literal["pairwise", "naive", "ttc", "distance"] = "pairwise"
-    """closing check: the paper's pairwise one, or a baseline"""
+    rule: Literal["pairwise", "naive", "ttc", "distance", "predictive"] = "pairwise"
+    """closing check: the paper's pairwise one, a baseline, or bikeped's own, predictive, which asks
+    for the seven keys from least_closing_mps on, and not for d_min_m to speed_adaptive"""
     memory_frames: Annotated[int, Meta(ge=0, le=3000)] = 58
     """N: a cyclist is remembered this many nominal frames; 0, the paper's rule without memory, is
     for conformance only: `bikeped run` refuses it"""
@@ -230,6 +231,20 @@ class DecisionConfig(Section, frozen=True):
     """cyclist's deceleration in the stopping distance, m/s^2"""
     ttc_s: Annotated[float, Meta(gt=0, le=60)] = 3.0
     """time to collision below which rule ttc fires, s"""
+    least_closing_mps: Annotated[float, Meta(ge=0, le=10)] = 0.7
+    """rule predictive: slower than this, two do not close in: below a walker's own speed, m/s"""
+    least_cycling_mps: Annotated[float, Meta(ge=0, le=10)] = 1.0
+    """rule predictive: who rides slower could stop at once, m/s"""
+    pass_within_m: Annotated[float, Meta(ge=0, le=25)] = 7.5
+    """rule predictive: a pass this near may yet become a contact by a turn, m"""
+    pass_growth_mps: Annotated[float, Meta(ge=0, le=5)] = 0.4
+    """rule predictive: so much wider a second of time to the pass, which is less sure then, m/s"""
+    stopping_share: Annotated[float, Meta(gt=0, le=2)] = 0.5
+    """rule predictive: the cyclist's stopping distance is over this share of the gap"""
+    contact_within_s: Annotated[float, Meta(gt=0, le=10)] = 5.0
+    """rule predictive: or contact, at this closing speed, is nearer than this, s"""
+    stay_margin: Annotated[float, Meta(ge=0, le=0.9)] = 0.3
+    """rule predictive: an alert stays on while all this holds with numbers wider by this share"""
     max_unseen_s: Annotated[float, Meta(ge=0, le=2)] = 1.0
     """a track counts, as present, in memory and in a pair, only while seen within this time, s"""
     alert_on_frames: Annotated[int, Meta(ge=1, le=30)] = 2

@@ -33,6 +33,7 @@ class Decider:
         self._last_cyclist_s = -math.inf
         self._shown = ShownAlert(settings.shown)
         self._alert_pair: PairMetrics | None = None
+        self._on: set[tuple[int, int]] = set()  # cyclist and pedestrian of pairs that fired
 
     def decide(
         self,
@@ -54,7 +55,11 @@ class Decider:
             counted = np.ones(len(ids), np.bool_)
         rows, newest = self._buffer.append(time_s, ids, kind, xy_m, velocity_mps, counted)
         pairs = pair_rows(rows, newest)
-        checks = evaluate_rule(rows, pairs, self.settings)
+        cyclist_id = rows.id[pairs.cyclist_row[pairs.cyclist]].tolist()
+        both = list(zip(cyclist_id, rows.id[pairs.pedestrian_row].tolist(), strict=True))
+        was_on = np.asarray([ids in self._on for ids in both], np.bool_) if self._on else None
+        checks = evaluate_rule(rows, pairs, self.settings, was_on)
+        self._on = {both[i] for i in checks.fires.nonzero()[0].tolist()}
         if np.count_nonzero((kind == CYCLIST) & counted):
             self._last_cyclist_s = time_s
         pedestrians = np.count_nonzero((kind == PEDESTRIAN) & counted)
@@ -69,11 +74,9 @@ class Decider:
             self._alert_pair = pair
         state = State(shown_states(np.asarray(raw), np.asarray(shown)).item())
         sentence = explain(raw, pair, pedestrians, since_s, self.settings)
+        sentence = shown_sentence(raw, state, sentence, self.settings)
         if state is State.ALERT and raw is not State.ALERT:
             pair = self._alert_pair
-            sentence = f"ALERT: held for {self.settings.shown.hold_s:g} s. Now {sentence}"
-        elif state is not raw:
-            sentence = sentence.replace(raw.name, f"{state.name}, not yet sure", 1)
         return Decision(time_s, state, sentence, pair, raw)
 
 
@@ -99,11 +102,13 @@ def pair_metrics(
         "speed_mps",
         "d_max_m",
     )
+    course = ("closing_mps", "pass_m", "pass_s", "contact_s")
     return PairMetrics(
         cyclist_id=int(rows.id[pairs.cyclist_row[pairs.cyclist[index]]]),
         pedestrian_id=int(rows.id[pairs.pedestrian_row[index]]),
         d_min_m=settings.d_min_m,
         **{name: float(getattr(checks, name)[index]) for name in names},
+        **{name: float(getattr(checks.course, name)[index]) for name in course},
     )
 
 
@@ -140,6 +145,15 @@ def explain(
             f"(rule {settings.rule})."
         )
     return f"WARNING: {pair_text} are {gap}, {_reason_not_to_alert(pair, past, settings)}."
+
+
+def shown_sentence(raw: State, state: State, sentence: str, settings: RuleSettings) -> str:
+    """The raw state's sentence, as it reads where another one is shown."""
+    if state is raw:
+        return sentence
+    if state is State.ALERT:
+        return f"ALERT: held for {settings.shown.hold_s:g} s. Now {sentence}"
+    return sentence.replace(f"{raw.name}:", f"{state.name}: not yet sure:", 1)
 
 
 def _reason_not_to_alert(pair: PairMetrics, past: str, settings: RuleSettings) -> str:

@@ -15,12 +15,13 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from bikeped.decision.predictive import CONTACT_M, Courses, PredictiveSettings, alerts, courses
 from bikeped.decision.shown import ShownSettings
 from bikeped.decision.track_rows import EPSILON_S, IndexArray, Pairs, TrackRows
 from bikeped.decision.who_counts import without_riders
 from bikeped.types import BoolArray, FloatArray, State
 
-RuleName = Literal["pairwise", "naive", "ttc", "distance"]
+RuleName = Literal["pairwise", "naive", "ttc", "distance", "predictive"]
 
 #: Distances closer than this are equal: at a constant gap, rounding must not look like closing.
 EPSILON_M = 1e-9
@@ -53,6 +54,7 @@ class RuleSettings:
     max_unseen_s: float = 1.0
     count_all: bool = False  #: riders and parked cycles too, as in the paper's simulation
     shown: ShownSettings = field(default_factory=ShownSettings)
+    predictive: PredictiveSettings = field(default_factory=PredictiveSettings)
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,8 @@ class PairChecks:
     rule ttc: time to collision below `ttc_s`; rule distance: always). `evaluated` is false for
     pairs that fail one of the first three or have no earlier position: these have a lookback of
     0 s, no displacement, and neither of the last two. One rider (`who_counts`) does not fire.
+    Rule predictive asks for `in_range` and its own conditions on the `course` alone; for it all
+    others but `fires` are true.
     """
 
     fires: BoolArray
@@ -79,6 +83,7 @@ class PairChecks:
     displacement_m: FloatArray
     speed_mps: FloatArray
     d_max_m: FloatArray
+    course: Courses
 
 
 def stopping_distance(
@@ -88,8 +93,14 @@ def stopping_distance(
     return speed_mps * reaction_s + speed_mps * speed_mps / (2 * deceleration_mps2)
 
 
-def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> PairChecks:
-    """Applies the rule `settings.rule` to every pair [m]."""
+def evaluate_rule(
+    rows: TrackRows, pairs: Pairs, settings: RuleSettings, was_on: BoolArray | None = None
+) -> PairChecks:
+    """Applies the rule `settings.rule` to every pair [m].
+
+    `was_on` [m]: pairs that fired in the frame before the first one given, which rule predictive
+    asks for; None: none.
+    """
     cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist], pairs.pedestrian_row
     c_now, p_now = rows.xy_m[cyclist], rows.xy_m[pedestrian]
     distance = _length(c_now - p_now)
@@ -101,8 +112,32 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
         d_max = np.maximum(
             d_max, stopping_distance(speed, settings.reaction_s, settings.deceleration_mps2)
         )
+    course = courses(rows, pairs)
     above_d_min, below_d_max = distance >= settings.d_min_m, distance <= d_max
     in_range = (_length(c_now) <= settings.max_range_m) & (_length(p_now) <= settings.max_range_m)
+    if settings.rule == "predictive":
+        stopping = stopping_distance(
+            course.cyclist_mps, settings.reaction_s, settings.deceleration_mps2
+        )
+        gap = np.maximum(distance - CONTACT_M, 0.0)
+        on = alerts(rows, pairs, course, gap, stopping, settings.predictive, was_on) & in_range
+        yes, none = np.ones(len(pairs), np.bool_), np.zeros(len(pairs))
+        return PairChecks(
+            fires=without_riders(rows, pairs, on),
+            evaluated=yes,
+            above_d_min=yes,
+            below_d_max=yes,
+            in_range=in_range,
+            closing=yes,
+            displacement_ok=yes,
+            distance_m=distance,
+            distance_then_m=distance,
+            lookback_s=none,
+            displacement_m=none,
+            speed_mps=course.cyclist_mps,
+            d_max_m=np.full(len(pairs), settings.max_range_m),
+            course=course,
+        )
     # Only these are looked up in the past: of thousands of pairs in a crowd few are within bounds.
     index = (above_d_min & below_d_max & in_range).nonzero()[0]
     c_past, p_past, elapsed = _positions_before(
@@ -126,8 +161,9 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
     distance_then[index], lookback[index], displacement[index] = past_distance, elapsed, moved
     evaluated = lookback > 0
     closing, displacement_ok = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-    closing[index] = is_closing & evaluated[index]
-    displacement_ok[index] = second_check & evaluated[index]
+    known = evaluated[index] | (settings.rule == "distance")  # which asks for no history
+    closing[index] = is_closing & known
+    displacement_ok[index] = second_check & known
     fires = closing & displacement_ok
     return PairChecks(
         fires=fires if settings.count_all else without_riders(rows, pairs, fires),
@@ -143,6 +179,7 @@ def evaluate_rule(rows: TrackRows, pairs: Pairs, settings: RuleSettings) -> Pair
         displacement_m=displacement,
         speed_mps=speed,
         d_max_m=d_max,
+        course=course,
     )
 
 

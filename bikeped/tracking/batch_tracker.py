@@ -201,6 +201,7 @@ class BatchTracker:
         track_kind, detected_kind = self.kind.ravel()[track], kind.ravel()[place]
         allowed = (
             (track_kind != detected_kind)
+            & (detected_kind >= 0)
             & (track_kind != _VEHICLE)
             & (detected_kind != _VEHICLE)
             & (cost <= self.settings.rider_radius_m**2)

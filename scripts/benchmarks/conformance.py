@@ -13,7 +13,7 @@ from bikeped.decision.decider import Decider
 from bikeped.lab.experiments import optimizer
 from bikeped.lab.experiments.reproduce import ReproduceSettings, reproduce
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
-from bikeped.lab.simulation.simulate import SIMULATION_TRACKER
+from bikeped.lab.simulation.simulate import SimulatedTracker
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare
 from bikeped.tracking.batch_tracker import BatchTracker
 
@@ -30,7 +30,7 @@ def run(figures: Figures) -> None:
         """One configuration with localisation error, frame by frame: 1/14 of the comparison."""
         suite = Suite.load(scenarios, loaded)
         for scene in suite.detection_sequences():
-            tracker = BatchTracker(SIMULATION_TRACKER)
+            tracker = BatchTracker(SimulatedTracker.of(loaded).settings)
             decider = Decider(rule_settings(CONFIGURATIONS["selected"]))
             for i in range(len(scene.xy_m)):
                 there = scene.detected[i]

@@ -163,6 +163,8 @@ def soak(rig: Rig) -> None:
     process = Path(f"/proc/{service.process.pid}")
 
     def now() -> tuple[float, int]:
+        service.health()
+        time.sleep(2)  # the server's end of that connection is closed by then
         pages = int((process / "statm").read_text().split()[1])
         return pages * 4096 / 1e6, len(list((process / "fd").iterdir()))
 

@@ -262,6 +262,8 @@ def plain_fires(rule, frames, i, c, p):
     j = i
     while j > 0 and {c, p} <= set(frames[j - 1][1]) and frames[j][0] > target + 1e-6:
         j -= 1
+    if rule.rule == "distance":
+        return True
     if j == i:
         return False
     then, (c_old, p_old) = frames[j][0], (frames[j][1][c][1:], frames[j][1][p][1:])

@@ -216,10 +216,10 @@ def test_ttc_needs_a_closing_speed_above_a_tenth(closing, fires):
     assert last_state(settings, frames) is (State.ALERT if fires else State.WARNING)
 
 
-def test_distance_asks_for_the_bounds_only_from_the_second_frame_on():
+def test_distance_asks_for_the_bounds_only_and_for_no_history():
     frames = pair(still(0.0, 5.0), still(0.0, 0.0), 3)
     states = [d.state for d in run(replace(SELECTED, rule="distance"), frames)]
-    assert states == [State.WARNING, State.ALERT, State.ALERT]
+    assert states == [State.ALERT] * 3
 
 
 # ---- looking back

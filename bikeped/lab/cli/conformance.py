@@ -239,20 +239,35 @@ def deployment(run: SuiteRun, trials: int) -> None:
 
     camera = run.suite.camera
     with progress_bar("road widths", len(roads.WIDTHS_FT)) as progress:
-        result = roads.deployment(camera, run.decision, trials, run.seed, progress=progress)
+        result = roads.deployment(
+            camera, run.suite.tracker, run.decision, trials, run.seed, progress=progress
+        )
     run.emit(result)
 
 
 @command.command("placement")
 @experiment_options
 @trials_option(20)
-def placement(run: SuiteRun, trials: int) -> None:
+@click.option(
+    "--paper",
+    is_flag=True,
+    help="As the paper's grid: true positions of what was detected, no tracker, all danger frames.",
+)
+def placement(run: SuiteRun, trials: int, paper: bool) -> None:
     """Sensitivity by camera height and pitch on a road of 40 ft."""
     from bikeped.lab.experiments import deployment as roads
 
     camera = run.suite.camera
     with progress_bar("heights", len(roads.HEIGHTS_M)) as progress:
-        result = roads.placement(camera, run.decision, trials, run.seed, progress=progress)
+        result = roads.placement(
+            camera,
+            run.suite.tracker,
+            run.decision,
+            trials,
+            run.seed,
+            progress=progress,
+            paper=paper,
+        )
     run.emit(result)
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
     from bikeped.lab.result_tables import CellValue, ExperimentResult, ResultTable
+    from bikeped.lab.simulation.simulate import TrackerName
     from bikeped.lab.simulation.suite import Suite
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -47,6 +48,16 @@ def scenarios_option(command: F) -> F:
     )(command)
 
 
+tracker_option = click.option(
+    "--tracker",
+    type=click.Choice(["deployed", "paper"]),
+    default="deployed",
+    show_default=True,
+    help="The configuration's tracker, as the pole runs it, or the one that the paper's figures "
+    "hold with (every track counts, the light shows the raw state).",
+)
+
+
 @dataclass
 class SuiteRun:
     """The options that all conformance commands share; configuration and suite on first use.
@@ -58,6 +69,7 @@ class SuiteRun:
     overrides: tuple[str, ...]
     scenarios_dir: Path | None
     json_path: str | None
+    tracker: TrackerName = "deployed"
     seed_option: int | None = None
 
     @property
@@ -74,7 +86,8 @@ class SuiteRun:
         from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
         from bikeped.lab.simulation.suite import Suite
 
-        return Suite.load(load_scenarios(self.scenarios_dir or bundled_folder()), self.loaded)
+        scenarios = load_scenarios(self.scenarios_dir or bundled_folder())
+        return Suite.load(scenarios, self.loaded, self.tracker)
 
     @property
     def decision(self) -> DecisionConfig:
@@ -106,7 +119,7 @@ class SuiteRun:
 
 
 def suite_options(function: Callable[..., T]) -> Callable[..., T]:
-    """`-c`, `--set`, `--scenarios` and `--json`, which the function gets as a `SuiteRun`.
+    """`-c`, `--set`, `--scenarios`, `--tracker`, `--json`, which the function gets as a `SuiteRun`.
 
     Its files are checked before it starts (`cli.guard`).
     """
@@ -117,13 +130,14 @@ def suite_options(function: Callable[..., T]) -> Callable[..., T]:
         overrides: tuple[str, ...],
         scenarios_dir: Path | None,
         json_path: str | None,
+        tracker: TrackerName,
         seed: int | None = None,
         **options: Any,
     ) -> T:
-        run = SuiteRun(config_path, overrides, scenarios_dir, json_path, seed)
+        run = SuiteRun(config_path, overrides, scenarios_dir, json_path, tracker, seed)
         return function(run, **options)
 
-    return config_options(scenarios_option(json_option(guarded(with_run))))
+    return config_options(scenarios_option(tracker_option(json_option(guarded(with_run)))))
 
 
 def experiment_options(function: Callable[..., T]) -> Callable[..., T]:

@@ -13,9 +13,10 @@ from bikeped.cli.common import config_options, json_option, progress_bar
 from bikeped.cli.guard import guarded
 from bikeped.errors import BikepedError
 from bikeped.files import make_folder, write_whole
-from bikeped.lab.cli.conformance_shared import SuiteRun, rich_table
+from bikeped.lab.cli.conformance_shared import SuiteRun, rich_table, tracker_option
 
 if TYPE_CHECKING:
+    from bikeped.lab.simulation.simulate import TrackerName
     from bikeped.lab.traffic.suite import Noise
 
 
@@ -70,6 +71,7 @@ def encounters(seed: int, count: int, out: Path) -> None:
     help="Write a page in one file with every alert to step through, nuisance first: of the "
     "first --rule, or of the configured decision.",
 )
+@tracker_option
 @json_option
 @guarded
 def traffic(
@@ -80,6 +82,7 @@ def traffic(
     noise: Noise,
     seed: int,
     html_path: Path | None,
+    tracker: TrackerName,
     json_path: str | None,
 ) -> None:
     """Real or recorded trajectories through tracker and rules: nuisance, misses, by scene.
@@ -92,7 +95,7 @@ def traffic(
     from bikeped.lab.traffic.result import FORESIGHT, traffic_result, with_alert_settings
     from bikeped.lab.traffic.suite import TrafficSuite
 
-    run = SuiteRun(config_path, overrides, None, json_path, seed)
+    run = SuiteRun(config_path, overrides, None, json_path, tracker, seed)
     known = {**CONFIGURATIONS, "configured": run.decision}
     every = [n for n in known if n != "configured" or run.decision not in CONFIGURATIONS.values()]
     chosen = {name: known[name] for name in rules or every if name in known}
@@ -101,7 +104,7 @@ def traffic(
             near = difflib.get_close_matches(name, known, 1)
             remedy = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
             raise BikepedError(f"--rule {name}: there is no such configuration; {remedy}")
-    suite = TrafficSuite.load(read_traffic(traffic), run.loaded, noise, seed)
+    suite = TrafficSuite.load(read_traffic(traffic), run.loaded, noise, seed, tracker)
     with progress_bar("rules", len(chosen) + 1) as progress:
         result = traffic_result(suite, chosen, run.loaded, progress)
     if html_path is not None:

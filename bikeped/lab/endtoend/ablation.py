@@ -22,8 +22,9 @@ from bikeped.lab.simulation.perception import PerceptionResult
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.suite import Suite
 from bikeped.pipeline.track_and_decide import TrackAndDecide
-from bikeped.types import Detections, GroundPoints
+from bikeped.types import Decision, Detections, GroundPoints
 
+#: Shown and raw state codes [2, f].
 States = npt.NDArray[np.int8]
 
 
@@ -47,16 +48,18 @@ def run_ablation(
 
     def points(in_frame: bool) -> States:
         pairs = zip(runs, suite.perception_results, strict=True)
-        return np.concatenate(
-            [states_from_points(tracker, run, seen, in_frame) for run, seen in pairs]
-        )
+        return np.hstack([states_from_points(tracker, run, seen, in_frame) for run, seen in pairs])
 
     def boxes(detections: Callable[[EndToEndRun, int], Detections]) -> States:
-        return np.concatenate([states_from_boxes(tracker, run, detections) for run in runs])
+        return np.hstack([states_from_boxes(tracker, run, detections) for run in runs])
 
+    scripted = suite.outcome(decision)
     steps: list[tuple[str, str, States]] = [
-        ("scripted", "positions with the box model's error", suite.states(decision)),
-        ("tracker", "the pole's tracker in place of the simulation's", points(in_frame=False)),
+        (
+            "scripted",
+            "positions with the box model's error",
+            np.stack([scripted.states, scripted.raw]),
+        ),
         ("picture", "objects outside the picture are not seen", points(in_frame=True)),
         ("outline", "boxes around what was drawn", boxes(_whole)),
         ("occlusion", "hidden parts are not seen", boxes(_visible)),
@@ -66,11 +69,11 @@ def run_ablation(
         (
             "false detections",
             "all detections: the deployed loop",
-            np.concatenate([run.state for run in runs]),
+            np.hstack([[run.state, run.raw_state] for run in runs]),
         ),
     ]
     return [
-        AblationStep(name, adds, states, measure(suite.truth_frames, states))
+        AblationStep(name, adds, states, measure(suite.truth_frames, *states))
         for name, adds, states in steps
     ]
 
@@ -78,9 +81,9 @@ def run_ablation(
 def states_from_points(
     tracker: TrackAndDecide, run: EndToEndRun, seen: PerceptionResult, in_frame: bool
 ) -> States:
-    """States [f] from the simulation's positions; `in_frame`: of agents that were drawn."""
+    """States [2, f] from the simulation's positions; `in_frame`: of agents that were drawn."""
     tracker.reset()
-    states = []
+    decisions = []
     for frame in range(len(seen.present)):
         drawn = {o.id for o in run.objects[frame]}
         index = np.asarray(
@@ -92,20 +95,25 @@ def states_from_points(
             np.int64,
         )
         points = GroundPoints(seen.kind[index], seen.observed_m[frame, index], index)
-        states.append(int(tracker.update_from_points(points, frame / FPS).decision.state))
-    return np.asarray(states, np.int8)
+        decisions.append(tracker.update_from_points(points, frame / FPS).decision)
+    return _codes(decisions)
 
 
 def states_from_boxes(
     tracker: TrackAndDecide, run: EndToEndRun, detections: Callable[[EndToEndRun, int], Detections]
 ) -> States:
-    """States [f] from `detections(run, frame)`."""
+    """States [2, f] from `detections(run, frame)`."""
     tracker.reset()
     results = (
         tracker.update(detections(run, frame), run.width, run.height, frame / FPS, 0.0)
         for frame in range(len(run.state))
     )
-    return np.asarray([int(result.decision.state) for result in results], np.int8)
+    return _codes([result.decision for result in results])
+
+
+def _codes(decisions: Sequence[Decision]) -> States:
+    raw = [int(d.state if d.raw is None else d.raw) for d in decisions]
+    return np.asarray([[int(d.state) for d in decisions], raw], np.int8)
 
 
 def _exact(objects: Sequence[DrawnObject], whole: bool) -> Detections:

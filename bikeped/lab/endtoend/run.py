@@ -33,7 +33,8 @@ class EndToEndRun:
     scenario: Scenario
     objects: tuple[tuple[DrawnObject, ...], ...]
     detections: tuple[Detections, ...]
-    state: npt.NDArray[np.int8]  #: [f]
+    state: npt.NDArray[np.int8]  #: [f], as shown
+    raw_state: npt.NDArray[np.int8]  #: [f], of the rule
     width: int
     height: int
     detector: str
@@ -47,10 +48,13 @@ class _Recorder:
     def __init__(self) -> None:
         self.detections: list[Detections] = []
         self.state: list[int] = []
+        self.raw_state: list[int] = []
 
     async def on_frame_result(self, result: FrameResult) -> None:
         self.detections.append(result.detections)
-        self.state.append(int(result.tracking.decision.state))
+        decision = result.tracking.decision
+        self.state.append(int(decision.state))
+        self.raw_state.append(int(decision.state if decision.raw is None else decision.raw))
 
 
 def run_scenario(
@@ -85,6 +89,7 @@ def run_scenario(
         objects=tuple(source.objects),
         detections=tuple(recorder.detections),
         state=np.asarray(recorder.state, np.int8),
+        raw_state=np.asarray(recorder.raw_state, np.int8),
         width=size[0],
         height=size[1],
         detector=detector.name,

@@ -34,9 +34,19 @@ from bikeped.lab.process_pool import ProgressCallback, no_progress
 from bikeped.lab.result_tables import ExperimentResult, ResultTable
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.camera_pose import CameraPose
-from bikeped.lab.simulation.metrics import GroundTruthFrames
+from bikeped.lab.simulation.metrics import GroundTruthFrames, measure
+from bikeped.lab.simulation.paper_tracker import MAX_UNSEEN_FRAMES
 from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, simulate_perception
+from bikeped.lab.simulation.simulate import (
+    PAPER,
+    DetectionSequence,
+    SimulatedTracker,
+    TrackHistory,
+    build_rule_input,
+    outcome,
+)
 from bikeped.lab.simulation.truth import compute_ground_truth
+from bikeped.types import BoolArray, FloatArray
 
 FOOT_M = 0.3048
 WIDTHS_FT = (30, 40, 50, 60)
@@ -126,6 +136,7 @@ def _measure_views(
     trials: int,
     seed: int,
     recall: RecallModel,
+    tracker: SimulatedTracker,
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """By view: summaries over trials by the definition, and with invisible objects undetected."""
     truth = GroundTruthFrames.join([compute_ground_truth(scenario)])
@@ -135,14 +146,63 @@ def _measure_views(
         for camera, poses in views
     ]
     found = simulate_views(
-        observed, truth, LossModel(recall, None), {"": decision}, range(trials), seed
+        observed, truth, LossModel(recall, None), {"": decision}, range(trials), seed, tracker
     )
     results = [summarize_metrics(part[0, 0][""]) for part in found]
     return list(zip(results[: len(views)], results[len(views) :], strict=True))
 
 
+def _true_positions(
+    scenario: Scenario,
+    views: Sequence[tuple[GroundCamera, Sequence[CameraPose]]],
+    decision: DecisionConfig,
+    trials: int,
+    seed: int,
+    recall: RecallModel,
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """`_measure_views` as the paper has it: who is detected counts, where it truly is."""
+    truth = GroundTruthFrames.join([compute_ground_truth(scenario)])
+    truth = replace(truth, actionable=truth.danger)  # all frames with danger
+    settings = replace(PAPER.rule(decision), count_all=False)
+    results = []
+    for visible_only in (False, True):
+        for camera, poses in views:
+            seen = simulate_perception(scenario, camera, poses[0])
+            objects = detectable_objects(scenario, camera, poses, recall, visible_only)
+            metrics = []
+            for found in objects.trials(range(trials), seed, None):
+                run = build_rule_input(history_of(seen.true_m, seen.present, found), 0, settings)
+                states = outcome(run, settings).raw
+                metrics.append(measure(truth, states))
+            results.append(summarize_metrics(metrics))
+    return list(zip(results[: len(views)], results[len(views) :], strict=True))
+
+
+def history_of(true_m: FloatArray, present: BoolArray, found: DetectionSequence) -> TrackHistory:
+    """One scene's agents as tracks at their true places [f, a, 2]; those count that were detected
+    within the frames that the paper's tracker keeps a track."""
+    frames, agents = present.shape
+    number = np.arange(frames)[:, None]
+    last = np.maximum.accumulate(np.where(found.detected, number, -frames))
+    kept = number - last <= MAX_UNSEEN_FRAMES
+    one = (frames, 1, agents)
+    return TrackHistory(
+        reported=present[:, None],
+        id=np.broadcast_to(np.arange(1, agents + 1), one),
+        kind=np.broadcast_to(found.kind, one),
+        xy_m=np.nan_to_num(true_m)[:, None],
+        velocity_mps=np.zeros((*one, 2)),
+        acceleration_mps2=np.zeros((*one, 2)),
+        seen_s=np.full(one, np.inf),
+        parked=~kept[:, None],
+        frames=np.asarray([frames]),
+        delay_frames=np.zeros(1, np.int64),
+    )
+
+
 def deployment(
     camera: GroundCamera,
+    tracker: SimulatedTracker,
     decision: DecisionConfig,
     trials: int = DEPLOYMENT_TRIALS,
     seed: int = 0,
@@ -154,7 +214,7 @@ def deployment(
     rows: list[dict[str, Any]] = []
     for count, width in enumerate(WIDTHS_FT, 1):
         views = [(wide_camera(camera, h, p), camera_poses(width, n)) for h, p, n in cases]
-        found = _measure_views(road_scenario(width), views, decision, trials, seed, recall)
+        found = _measure_views(road_scenario(width), views, decision, trials, seed, recall, tracker)
         rows += [
             {
                 "width_ft": width,
@@ -168,7 +228,14 @@ def deployment(
         ]
         progress(count)
     rows.sort(key=lambda r: (-r["height_m"], r["cameras"], r["width_ft"]))
-    data = {"rows": rows, "trials": trials, "seed": seed, "recall": recall.mode, "fov_deg": FOV_DEG}
+    data = {
+        "rows": rows,
+        "trials": trials,
+        "seed": seed,
+        "recall": recall.mode,
+        "fov_deg": FOV_DEG,
+        "tracker": tracker.name,
+    }
     table = ResultTable.of(
         "deployment",
         "Road widths, one camera and two",
@@ -192,13 +259,20 @@ def deployment(
 
 def placement(
     camera: GroundCamera,
+    tracker: SimulatedTracker,
     decision: DecisionConfig,
     trials: int = PLACEMENT_TRIALS,
     seed: int = 0,
     recall: RecallModel = _SIZE,
     progress: ProgressCallback = no_progress,
+    *,
+    paper: bool = False,
 ) -> ExperimentResult:
-    """Height by pitch on a road of 40 ft, one camera. Progress counts heights."""
+    """Height by pitch on a road of 40 ft, one camera. Progress counts heights.
+
+    `paper`: as the paper's grid, without localisation error, over all danger frames, and with the
+    true positions of what was detected in place of a tracker.
+    """
     scenario = road_scenario(PLACEMENT_WIDTH_FT)
     poses = camera_poses(PLACEMENT_WIDTH_FT, 1)
     grids: dict[str, list[list[float | None]]] = {
@@ -208,7 +282,10 @@ def placement(
     }
     for count, height in enumerate(HEIGHTS_M, 1):
         views = [(wide_camera(camera, height, pitch), poses) for pitch in PITCHES_DEG]
-        found = _measure_views(scenario, views, decision, trials, seed, recall)
+        if paper:
+            found = _true_positions(scenario, views, decision, trials, seed, recall)
+        else:
+            found = _measure_views(scenario, views, decision, trials, seed, recall, tracker)
         for key in ("sensitivity", "specificity"):
             grids[key].append([by_definition[key]["mean"] for by_definition, _ in found])
         grids["visible_only_sensitivity"].append([v["sensitivity"]["mean"] for _, v in found])
@@ -218,11 +295,16 @@ def placement(
         "pitch_deg": list(PITCHES_DEG),
         **grids,
         "width_ft": PLACEMENT_WIDTH_FT,
+        "tracker": "none: true positions" if paper else tracker.name,
+        "localisation_error": not paper,
         "trials": trials,
         "seed": seed,
         "recall": recall.mode,
         "fov_deg": FOV_DEG,
     }
+    how = f"with localisation error and the tracker {tracker.name}"
+    if paper:
+        how = "as the paper: true positions of what was detected, all frames with danger"
     columns = {f"{pitch:g}\N{DEGREE SIGN}, %": str(i) for i, pitch in enumerate(PITCHES_DEG)}
     tables = tuple(
         ResultTable.of(
@@ -233,7 +315,7 @@ def placement(
                 for height, row in zip(HEIGHTS_M, grids[grid], strict=True)
             ],
             {"height, m": "height", **columns},
-            f"{trials} trials a cell",
+            f"{trials} trials a cell; {how}",
         )
         for name, title, grid in (
             ("placement", "Sensitivity by height and pitch", "sensitivity"),

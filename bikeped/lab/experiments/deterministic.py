@@ -20,8 +20,9 @@ from bikeped.decision.episodes import onsets
 from bikeped.errors import ScenarioError
 from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells
 from bikeped.lab.scenarios.scenario import SIZES_M
-from bikeped.lab.simulation.metrics import Metrics, finite_or_none, measure
+from bikeped.lab.simulation.metrics import Metrics, finite_or_none
 from bikeped.lab.simulation.perception import error_table, localise
+from bikeped.lab.simulation.simulate import PAPER, SimulatedTracker
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite, compare, compare_json
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruthSettings
 from bikeped.types import State
@@ -61,7 +62,7 @@ def select_scenario(suite: Suite, name: str) -> Suite:
 def run_table(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     """Every scenario under one configuration, and the totals."""
     states = suite.states(decision)
-    metrics = measure(suite.truth_frames, states)
+    metrics = suite.measure(decision)
     rows: list[dict[str, Any]] = []
     for index, (scenario, truth) in enumerate(zip(suite.scenarios, suite.truths, strict=True)):
         frames = states[suite.rule_input.frame_slice(index)]
@@ -159,10 +160,30 @@ def localisation_errors(suite: Suite) -> ExperimentResult:
     return ExperimentResult("errors", {"table": table, "map": maps}, (printed,))
 
 
+def trackers_table(suite: Suite, loaded: LoadedConfig) -> ExperimentResult:
+    """The configurations with the pole's tracker and with the paper's, side by side."""
+    trackers = (SimulatedTracker.of(loaded), PAPER)
+    rows = [
+        {"configuration": name, "tracker": tracker.name, **other.measure(decision).as_dict()}
+        for tracker in trackers
+        for other in [replace(suite, tracker=tracker)]
+        for name, decision in CONFIGURATIONS.items()
+    ]
+    rows.sort(key=lambda row: list(CONFIGURATIONS).index(row["configuration"]))
+    table = ResultTable(
+        "trackers",
+        "The pole's tracker and the paper's",
+        ("configuration", "tracker", *METRIC_COLUMNS),
+        [(r["configuration"], r["tracker"], *cells(r, METRIC_COLUMNS)) for r in rows],
+        "deployed: the configuration's tracker, who counts and what is shown as on the pole; "
+        "paper: the tracker that the paper's figures hold with",
+    )
+    return ExperimentResult("trackers", {"rows": rows}, (table,))
+
+
 def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     """The same decisions under other thresholds of the ground truth, one varied at a time."""
     base = GroundTruthSettings(braking=suite.truth_settings.braking)
-    states = suite.states(decision)
     cases: list[tuple[str, float | None, GroundTruthSettings]] = [
         *(("cpa_radius_m", v, replace(base, cpa_radius_m=v)) for v in CPA_RADII_M),
         *(("stopping_margin", v, replace(base, stopping_margin=v)) for v in STOPPING_MARGINS),
@@ -174,7 +195,7 @@ def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> ExperimentResul
             "parameter": parameter,
             "value": value,
             "default": settings == base,
-            **measure(suite.with_truth(settings).truth_frames, states).as_dict(),
+            **suite.measure(decision, truth=suite.with_truth(settings).truth_frames).as_dict(),
         }
         for parameter, value, settings in cases
     ]
@@ -202,12 +223,11 @@ def truth_sensitivity(suite: Suite, decision: DecisionConfig) -> ExperimentResul
 
 def braking_profiles(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     """The same decisions against ground truth in which all cyclists brake by one profile."""
-    states = suite.states(decision)
     profiles = {"scenario": None, "bicycle": "bicycle", "ebike": "ebike", "aashto": "aashto"}
     rows: list[dict[str, Any]] = []
     for name, braking in profiles.items():
         other = suite.with_truth(replace(suite.truth_settings, braking=braking))
-        rows.append({"profile": name, "metrics": measure(other.truth_frames, states).as_dict()})
+        rows.append({"profile": name, "metrics": other.measure(decision).as_dict()})
     table = ResultTable(
         "braking",
         "Braking profiles of the ground truth",
@@ -224,7 +244,7 @@ def warning_budgets(suite: Suite, decision: DecisionConfig) -> ExperimentResult:
     The class goes by the worst onset of a scenario; a scenario without any is "below".
     """
     states = suite.states(decision)
-    metrics: Metrics = measure(suite.truth_frames, states)
+    metrics: Metrics = suite.measure(decision)
     rows: list[dict[str, Any]] = []
     for index, (scenario, truth) in enumerate(zip(suite.scenarios, suite.truths, strict=True)):
         if not truth.actionable.any():

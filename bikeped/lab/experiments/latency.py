@@ -54,10 +54,12 @@ def sweep(
     scenes = [
         s for ms in delays_ms for s in suite.detection_sequences(delay_frames=delay_frames(ms))
     ]
-    tracked = track(scenes)
+    tracked = track(scenes, suite.tracker)
     data: dict[str, Any] = {"delay_ms": list(delays_ms)}
     for name, order in PREDICTORS.items():
-        found = measure_repetitions(tracked, order, suite.truth_frames, {"": decision})[""]
+        found = measure_repetitions(
+            tracked, order, suite.truth_frames, {"": decision}, suite.tracker
+        )[""]
         rows = [metrics.as_dict() for metrics in found]
         data[name] = {figure: [row[figure] for row in rows] for figure in FIGURES}
     return ExperimentResult("latency", data, (_table(data, "latency", "Camera latency"),))

@@ -15,14 +15,13 @@ import numpy as np
 import scipy
 from scipy.optimize import Bounds, differential_evolution
 
-from bikeped.config.build import rule_settings
 from bikeped.config.schema import DecisionConfig
 from bikeped.errors import ScenarioError
 from bikeped.lab.experiments.deterministic import METRIC_COLUMNS
 from bikeped.lab.process_pool import ProgressCallback, no_progress
 from bikeped.lab.result_tables import ExperimentResult, ResultTable, cells
 from bikeped.lab.simulation.metrics import Metrics, measure
-from bikeped.lab.simulation.simulate import states
+from bikeped.lab.simulation.simulate import outcome
 from bikeped.lab.simulation.suite import Suite
 from bikeped.types import FloatArray
 
@@ -94,7 +93,8 @@ def optimize(
 
     def evaluate(point: FloatArray) -> float:
         nonlocal count, best
-        value = cost(measure(truth, states(run, rule_settings(decision_at(point, base)))))
+        found = outcome(run, suite.tracker.rule(decision_at(point, base)))
+        value = cost(measure(truth, found.states, found.raw))
         count += 1
         progress(count)
         if value < best:

@@ -28,6 +28,7 @@ from bikeped.lab.experiments.deterministic import (
     compare_table,
     localisation_errors,
     run_table,
+    trackers_table,
     truth_sensitivity,
     warning_budgets,
 )
@@ -73,16 +74,17 @@ EXPERIMENTS: dict[str, Experiment] = {
         suite, loaded.config.decision, recall=s.recall, trials=s.trials, seed=s.seed
     ),
     "deployment": lambda suite, loaded, s: deployment.deployment(
-        suite.camera, loaded.config.decision, s.deployment_trials, s.seed, s.recall
+        suite.camera, suite.tracker, loaded.config.decision, s.deployment_trials, s.seed, s.recall
     ),
     "placement": lambda suite, loaded, s: deployment.placement(
-        suite.camera, loaded.config.decision, s.placement_trials, s.seed, s.recall
+        suite.camera, suite.tracker, loaded.config.decision, s.placement_trials, s.seed, s.recall
     ),
     "latency": lambda suite, loaded, _: latency.sweep(suite, loaded.config.decision),
     "truth": lambda suite, loaded, _: truth_sensitivity(suite, loaded.config.decision),
     "braking": lambda suite, loaded, _: braking_profiles(suite, loaded.config.decision),
     "run": lambda suite, loaded, _: run_table(suite, loaded.config.decision),
     "compare": lambda suite, loaded, s: compare_table(suite, loaded, seed=s.seed),
+    "trackers": lambda suite, loaded, _: trackers_table(suite, loaded),
     "budgets": lambda suite, loaded, _: warning_budgets(suite, loaded.config.decision),
     "errors": lambda suite, loaded, _: localisation_errors(suite),
 }
@@ -90,6 +92,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 REPORT_ORDER = (
     "run",
     "compare",
+    "trackers",
     "budgets",
     "errors",
     "truth",
@@ -121,6 +124,7 @@ def cache_key(name: str, suite: Suite, loaded: LoadedConfig, settings: Reproduce
         list(suite.names),
         [scenario.hazard for scenario in suite.scenarios],
         repr(suite.pose),
+        suite.tracker.name,
         repr(suite.truth_settings),
         loaded.hash,
         repr(settings),

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bikeped.config.build import rule_settings
 from bikeped.config.schema import DecisionConfig
 from bikeped.decision.episodes import onsets, runs
 from bikeped.lab.plotting import (
@@ -97,7 +96,7 @@ def _distances(axes: Axes, suite: Suite, decision: DecisionConfig, index: int) -
     nearest = np.where(np.isfinite(truth.nearest_m), truth.nearest_m, np.nan)
     axes.plot(truth.time_s, nearest, color=BLUE, zorder=3)
     part = suite.rule_input.frame_slice(index)
-    found = verdicts(suite.rule_input, rule_settings(decision))
+    found = verdicts(suite.rule_input, suite.tracker.rule(decision))
     frame = suite.rule_input.rows.frame[suite.rule_input.pairs.pedestrian_row]
     fired = found.fires & (frame >= part.start) & (frame < part.stop)
     seconds = suite.rule_input.time_s[frame[fired]]

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from bikeped.config.build import rule_settings
 from bikeped.config.schema import DecisionConfig
 from bikeped.lab.plotting import to_floats
 from bikeped.lab.process_pool import ProgressCallback, no_progress, run_jobs
@@ -29,10 +28,12 @@ from bikeped.lab.simulation.perception import (
 )
 from bikeped.lab.simulation.simulate import (
     DetectionSequence,
+    RuleInput,
+    SimulatedTracker,
     TrackHistory,
     build_rule_input,
     delay_history,
-    states,
+    outcome,
     track,
 )
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
@@ -42,8 +43,8 @@ TRIALS = 50
 #: Bytes that the tracker's history of one batch may take; about three times as much is in use while
 #: it is turned into rows. Larger batches are slower: they leave the cache.
 BATCH_BYTES = 60_000_000
-#: Reported, id, kind, and three vectors, of one slot in one frame.
-_SLOT_BYTES = 1 + 8 + 1 + 3 * 16
+#: Reported, id, kind, parked, time, and three vectors, of one slot in one frame.
+_SLOT_BYTES = 1 + 8 + 1 + 1 + 8 + 3 * 16
 
 #: Delay in frames, order of the predictor.
 Case = tuple[int, int]
@@ -102,10 +103,11 @@ def simulate_trials(
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
+    tracker: SimulatedTracker,
 ) -> dict[Case, TrialMetrics]:
     """Metrics of every trial by case and configuration; `truth` joins the scenarios of
     `observed` in their order."""
-    return simulate_views([observed], truth, loss, configurations, trials, seed)[0]
+    return simulate_views([observed], truth, loss, configurations, trials, seed, tracker)[0]
 
 
 def simulate_views(
@@ -115,6 +117,7 @@ def simulate_views(
     configurations: Mapping[str, DecisionConfig],
     trials: Sequence[int],
     seed: int,
+    tracker: SimulatedTracker,
 ) -> list[dict[Case, TrialMetrics]]:
     """`simulate_trials` for several views (other cameras) of the same scenarios, in one tracker."""
     every = [o for view in views for o in view]
@@ -133,11 +136,11 @@ def simulate_views(
             by_scenario = [o.trials(mine, seed, loss.burst) for o in views[view]]
             # Trial after trial, and in each the scenarios in their order: as `truth` has them.
             scenes += [sequences[i] for i in range(len(mine)) for sequences in by_scenario]
-        tracked = track(scenes)
+        tracked = track(scenes, tracker)
         for delay in dict.fromkeys(delay for delay, _ in loss.cases):
             late = delay_history(tracked, delay)
             for case in (c for c in loss.cases if c[0] == delay):
-                by_name = measure_repetitions(late, case[1], truth, configurations)
+                by_name = measure_repetitions(late, case[1], truth, configurations, tracker)
                 for name, metrics in by_name.items():
                     for (view, _), one in zip(part, metrics, strict=True):
                         found[view][case][name].append(one)
@@ -149,17 +152,20 @@ def measure_repetitions(
     order: int,
     truth: GroundTruthFrames,
     configurations: Mapping[str, DecisionConfig],
+    tracker: SimulatedTracker,
 ) -> TrialMetrics:
     """Metrics of every repetition of the suite in the batch, by configuration."""
-    run = build_rule_input(tracked, order)
     repeats = len(tracked.frames) // truth.count
-    return {
-        name: [
-            measure(truth, part)
-            for part in states(run, rule_settings(decision)).reshape(repeats, -1)
-        ]
-        for name, decision in configurations.items()
-    }
+    runs: dict[float, RuleInput] = {}  # who counts is the same for most configurations
+    metrics: TrialMetrics = {}
+    for name, decision in configurations.items():
+        settings = tracker.rule(decision)
+        if settings.max_unseen_s not in runs:
+            runs[settings.max_unseen_s] = build_rule_input(tracked, order, settings)
+        found = outcome(runs[settings.max_unseen_s], settings)
+        parts = zip(found.states.reshape(repeats, -1), found.raw.reshape(repeats, -1), strict=True)
+        metrics[name] = [measure(truth, *part) for part in parts]
+    return metrics
 
 
 def sorted_suite(suite: Suite) -> Suite:
@@ -179,7 +185,9 @@ def simulate_suite_trials(
         DetectableObjects.of(s.name, seen, loss.recall)
         for s, seen in zip(suite.scenarios, suite.perception_results, strict=True)
     ]
-    return simulate_trials(observed, suite.truth_frames, loss, configurations, trials, seed)
+    return simulate_trials(
+        observed, suite.truth_frames, loss, configurations, trials, seed, suite.tracker
+    )
 
 
 def run_trials(

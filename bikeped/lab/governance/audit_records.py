@@ -16,10 +16,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bikeped.config.build import rule_settings
 from bikeped.config.load import LoadedConfig, config_hash
 from bikeped.config.provenance import decision_hash
 from bikeped.config.schema import DecisionConfig
+from bikeped.decision.rules import RuleSettings
 from bikeped.errors import BikepedError
 from bikeped.files import WholeFile
 from bikeped.lab.simulation.simulate import RuleInput, verdicts
@@ -55,8 +55,8 @@ def audit_records(
 ) -> Iterator[dict[str, Any]]:
     """The records of all scenarios in order, header first."""
     run = suite.rule_input
-    states = suite.states(decision)
-    fired = _first_fired(run, decision)
+    found = suite.outcome(decision)
+    fired = _first_fired(run, suite.tracker.rule(decision))
     rows_of_frame = np.searchsorted(run.rows.frame, np.arange(len(run.time_s) + 1))
     config = msgspec.structs.replace(loaded.config, decision=decision)
     common = {
@@ -104,7 +104,8 @@ def audit_records(
                     }
                     for row in range(rows_of_frame[frame], rows_of_frame[frame + 1])
                 ],
-                "state": State(int(states[frame])).name,
+                "state": State(int(found.states[frame])).name,
+                "raw_state": State(int(found.raw[frame])).name,
                 "alert_tracks": fired.get(frame),
                 "pair": [int(truth.cyclist[i]), int(truth.pedestrian[i])] if known else None,
                 "distance_m": _real(truth.distance_m[i]),
@@ -116,9 +117,9 @@ def audit_records(
             }
 
 
-def _first_fired(run: RuleInput, decision: DecisionConfig) -> dict[int, dict[str, Any]]:
+def _first_fired(run: RuleInput, settings: RuleSettings) -> dict[int, dict[str, Any]]:
     """By frame: the first pair in track order that fired, as on the pole, and its distances."""
-    found = verdicts(run, rule_settings(decision))
+    found = verdicts(run, settings)
     pairs, rows = run.pairs, run.rows
     out: dict[int, dict[str, Any]] = {}
     for index in np.nonzero(found.fires)[0]:

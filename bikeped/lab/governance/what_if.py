@@ -110,7 +110,9 @@ def with_scenarios(suite: Suite, added: Sequence[Scenario]) -> Suite:
         raise ScenarioError(f"--scenario: {twice!r} is given twice; give each its own name")
     new = {s.name: s for s in added}
     kept = [new.pop(s.name, s) for s in suite.scenarios]
-    return Suite((*kept, *new.values()), suite.camera, suite.pose, suite.truth_settings)
+    return Suite(
+        (*kept, *new.values()), suite.camera, suite.tracker, suite.pose, suite.truth_settings
+    )
 
 
 def parse_truth(settings: GroundTruthSettings, items: Sequence[str]) -> GroundTruthSettings:

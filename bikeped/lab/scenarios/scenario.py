@@ -74,7 +74,9 @@ class Agent:
         t0, t1 = times[segment], times[segment + 1]
         part = np.clip((t - t0) / (t1 - t0), 0.0, 1.0)[:, None]
         xy = self.path[segment, 1:] * (1 - part) + self.path[segment + 1, 1:] * part
-        heading = self._headings()[segment]
+        # On a waypoint the heading is that of the segment that ends there (definitions, section 3).
+        ending = np.searchsorted(times, t - 1e-9, side="right") - 1
+        heading = self._headings()[np.clip(ending, 0, len(times) - 2)]
         return (np.where(present[:, None], xy, np.nan), np.where(present, heading, np.nan), present)
 
     def in_sight(self, t: FloatArray) -> BoolArray:

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from bikeped.decision.episodes import runs
 from bikeped.decision.shown import shown_states
-from bikeped.lab.simulation.metrics import GroundTruthFrames, finite_or_none, mean_known, measure
+from bikeped.lab.simulation.metrics import GroundTruthFrames, measure
 from bikeped.lab.simulation.simulate import FPS
 from bikeped.lab.simulation.truth import PEDESTRIAN_PRT_S, GroundTruth
-from bikeped.types import BoolArray, FloatArray, IntArray, State
+from bikeped.types import BoolArray, FloatArray, IntArray
 
 #: A real conflict belongs to an alert from this long before it to this long after it.
 BEFORE_S, AFTER_S = 0.2, 3.0
@@ -26,6 +26,12 @@ SHORT_S, RED_AGAIN_S = 0.5, 2.0
 #: Red with the nearest pair beyond this is red about people far apart.
 FAR_PAIR_M = 10.0
 _EPSILON_S = 1e-6
+_METRICS = (
+    *("sensitivity", "specificity", "specificity_shown", "specificity_strict"),
+    *("contact_sensitivity", "contact_sensitivity_raw", "sev_fn", "mean_warning_budget_s"),
+    "first_onset_lead_s",
+    "held_frames",
+)
 
 
 @dataclass(frozen=True)
@@ -161,22 +167,8 @@ def _metric_figures(truth: GroundTruthFrames, lights: Sequence[LightRecord]) -> 
     """The metrics of the shown state; specificity raw, shown (held frames apart), and strict."""
     raw = np.concatenate([light.raw for light in lights])
     states = np.concatenate([light.states for light in lights])
-    before, after = measure(truth, raw), measure(truth, states)
-    held = (states == int(State.ALERT)) & (raw != int(State.ALERT))
-    counted = ~truth.danger & ~held
-    false = int((counted & (states == int(State.ALERT))).sum())
-    return {
-        "sensitivity": finite_or_none(after.sensitivity),
-        "specificity": finite_or_none(before.specificity),
-        "specificity_shown": _per(int(counted.sum()) - false, int(counted.sum())),
-        "specificity_strict": finite_or_none(after.specificity),
-        "contact_sensitivity": finite_or_none(after.contact_sensitivity),
-        "contact_sensitivity_raw": finite_or_none(before.contact_sensitivity),
-        "sev_fn": finite_or_none(after.sev_fn),
-        "mean_warning_budget_s": finite_or_none(after.mean_warning_budget_s),
-        "first_onset_lead_s": finite_or_none(mean_known(after.by_scenario["first_onset_lead_s"])),
-        "held_frames": int(held.sum()),
-    }
+    metrics = measure(truth, states, raw).as_dict()
+    return {key: metrics[key] for key in _METRICS}
 
 
 def _per(part: float, whole: float) -> float | None:

@@ -63,7 +63,11 @@ class GroundTruthFrames:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Totals and metrics by scenario; NaN where there is nothing to count.
+    """Totals and metrics by scenario; NaN where there is nothing to count (definitions, 6 and 14).
+
+    All are of the shown state, but for `specificity` with its counts and `contact_sensitivity_raw`,
+    which are of the raw one. `specificity_shown` leaves held frames out of both counts,
+    `specificity_strict` counts those without danger as false.
 
     `by_scenario` holds arrays [n] by their JSON key: `sensitivity`, `specificity`, `sev_fn` (NaN
     without actionable frames), `fatigue`, `alert_latency_s` (infinite when no ALERT follows, NaN
@@ -75,9 +79,13 @@ class Metrics:
     false_positive: int
     false_negative: int
     true_negative: int
+    held_frames: int
     sensitivity: float
     specificity: float
+    specificity_shown: float
+    specificity_strict: float
     contact_sensitivity: float
+    contact_sensitivity_raw: float
     sev_fn: float
     fatigue: float
     mean_alert_latency_s: float
@@ -85,6 +93,8 @@ class Metrics:
     adequate_share: float
     false_episodes_per_hour: float
     nuisance_episodes_per_hour: float
+    alerts_with_danger: float
+    first_onset_lead_s: float
     by_scenario: Mapping[str, FloatArray]
 
     def as_dict(self) -> dict[str, Any]:
@@ -98,7 +108,7 @@ class Metrics:
         return {key: finite_or_none(values[index]) for key, values in self.by_scenario.items()}
 
 
-_COUNTS = ("true_positive", "false_positive", "false_negative", "true_negative")
+_COUNTS = ("true_positive", "false_positive", "false_negative", "true_negative", "held_frames")
 
 
 def finite_or_none(value: float) -> float | None:
@@ -106,9 +116,16 @@ def finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
-    """All metrics of states [f] against the ground truth of the same frames."""
+def measure(
+    truth: GroundTruthFrames, states: npt.NDArray[np.int8], raw: npt.NDArray[np.int8] | None = None
+) -> Metrics:
+    """All metrics of shown states [f] against the ground truth of the same frames.
+
+    `raw` [f] are the rule's own states; None: those that are shown.
+    """
     alert = states == int(State.ALERT)
+    raw_alert = alert if raw is None else raw == int(State.ALERT)
+    held = alert & ~raw_alert
     n, scenario = truth.count, truth.scenario
 
     def per(mask: BoolArray, weights: FloatArray | None = None) -> FloatArray:
@@ -118,7 +135,8 @@ def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
 
     hit, missed = alert & truth.actionable, ~alert & truth.actionable
     tp, fn = per(hit), per(missed)
-    fp, tn = per(alert & ~truth.danger), per(~alert & ~truth.danger)
+    fp, tn = per(raw_alert & ~truth.danger), per(~raw_alert & ~truth.danger)
+    calm, fresh = ~truth.danger, ~truth.danger & ~held
     frames = np.bincount(scenario, minlength=n)
     weight = per(truth.actionable, truth.severity)
     sev_fn = _ratio(per(missed, truth.severity), weight)
@@ -135,17 +153,23 @@ def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
     latency = _alert_latency(truth, alert)
     first_alert = np.full(n, np.inf)
     np.minimum.at(first_alert, scenario[alert], truth.time_s[alert])
-    false, nuisance = _episodes(truth, alert, onset)
+    false, nuisance, justified = _episodes(truth, alert, onset)
     hours = len(alert) / FPS / 3600
-    contact_hit = int((hit & truth.contact).sum())
+    lead_s = np.where(np.isfinite(first_alert), truth.closest_s - first_alert, np.nan)
     return Metrics(
         true_positive=int(tp.sum()),
         false_positive=int(fp.sum()),
         false_negative=int(fn.sum()),
         true_negative=int(tn.sum()),
+        held_frames=int(held.sum()),
         sensitivity=_share(tp.sum(), fn.sum()),
         specificity=_share(tn.sum(), fp.sum()),
-        contact_sensitivity=_share(contact_hit, int(truth.contact.sum()) - contact_hit),
+        specificity_shown=_share((fresh & ~alert).sum(), (fresh & alert).sum()),
+        specificity_strict=_share((calm & ~alert).sum(), (calm & alert).sum()),
+        contact_sensitivity=_share((truth.contact & alert).sum(), (truth.contact & ~alert).sum()),
+        contact_sensitivity_raw=_share(
+            (truth.contact & raw_alert).sum(), (truth.contact & ~raw_alert).sum()
+        ),
         sev_fn=mean_known(sev_fn),
         fatigue=float(fatigue.mean()),
         mean_alert_latency_s=mean_known(np.where(np.isinf(latency), NO_ALERT_LATENCY_S, latency)),
@@ -155,6 +179,8 @@ def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
         ),
         false_episodes_per_hour=false / hours,
         nuisance_episodes_per_hour=nuisance / hours,
+        alerts_with_danger=_share(justified, false + nuisance),
+        first_onset_lead_s=mean_known(lead_s),
         by_scenario={
             "sensitivity": _ratio(tp, tp + fn),
             "specificity": _ratio(tn, tn + fp),
@@ -163,9 +189,7 @@ def measure(truth: GroundTruthFrames, states: npt.NDArray[np.int8]) -> Metrics:
             "alert_latency_s": latency,
             "mean_warning_budget_s": mean_budget,
             "min_warning_budget_s": min_budget,
-            "first_onset_lead_s": np.where(
-                np.isfinite(first_alert), truth.closest_s - first_alert, np.nan
-            ),
+            "first_onset_lead_s": lead_s,
         },
     )
 
@@ -183,10 +207,10 @@ def _alert_latency(truth: GroundTruthFrames, alert: BoolArray) -> FloatArray:
         return np.where(np.isfinite(first), answered - first, np.nan)
 
 
-def _episodes(truth: GroundTruthFrames, alert: BoolArray, onset: BoolArray) -> tuple[int, int]:
-    """ALERT episodes without a danger frame: (false alarms, nuisances)."""
+def _episodes(truth: GroundTruthFrames, alert: BoolArray, onset: BoolArray) -> tuple[int, int, int]:
+    """ALERT episodes without a danger frame: false alarms, nuisances; and those with one."""
     if not alert.any():
-        return 0, 0
+        return 0, 0, 0
     episode = np.cumsum(onset) - 1
     count = int(onset.sum())
     dangerous = np.bincount(episode[alert], truth.danger[alert], minlength=count) > 0
@@ -194,7 +218,7 @@ def _episodes(truth: GroundTruthFrames, alert: BoolArray, onset: BoolArray) -> t
     np.minimum.at(nearest, episode[alert], truth.nearest_m[alert])
     harmless = ~dangerous
     near = nearest <= NUISANCE_M
-    return int((harmless & ~near).sum()), int((harmless & near).sum())
+    return int((harmless & ~near).sum()), int((harmless & near).sum()), int(dangerous.sum())
 
 
 def _share(part: float, rest: float) -> float:

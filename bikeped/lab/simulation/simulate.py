@@ -1,4 +1,4 @@
-"""The deployed tracker, predictor and rules over a batch of detection sequences.
+"""The deployed tracker (or the paper's), predictor and rules over a batch of detection sequences.
 
 An element of the batch is a scenario, or one Monte Carlo trial of it. All elements step through the
 same frames in one tracker; it gives track rows, on which a rule is evaluated once.
@@ -6,12 +6,17 @@ same frames in one tracker; it gives track rows, on which a rule is evaluated on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
+from bikeped.config.build import rule_settings, tracker_settings
+from bikeped.config.load import LoadedConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.decision.rules import (
     PairChecks,
     RuleSettings,
@@ -19,16 +24,52 @@ from bikeped.decision.rules import (
     is_remembered,
     resolve_state,
 )
+from bikeped.decision.shown import AS_RAW, shown_alert, shown_states
 from bikeped.decision.track_rows import Pairs, TrackRows, pair_rows
 from bikeped.decision.who_counts import counts
+from bikeped.lab.simulation.paper_tracker import PaperTracker
 from bikeped.tracking.batch_tracker import BatchTracker, TrackerSettings
 from bikeped.tracking.tracker import predict
-from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray
+from bikeped.types import BoolArray, FloatArray, IntArray, Kind, KindArray, State
 
 FPS = 30.0
-#: The paper's simulation tracker (definitions, section 7): the defaults of TrackerSettings.
-SIMULATION_TRACKER = TrackerSettings()
 DEFAULT_RULE = RuleSettings()
+TrackerName = Literal["deployed", "paper"]
+StateArray = npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class SimulatedTracker:
+    """Which tracker a simulation uses, and what comes with it (definitions, section 7).
+
+    `settings` are those of the configuration; None: the paper's own tracker, with which every track
+    counts and the light shows the raw state.
+    """
+
+    settings: TrackerSettings | None
+
+    @staticmethod
+    def of(loaded: LoadedConfig, name: TrackerName = "deployed") -> SimulatedTracker:
+        """The tracker of a configuration as the pole runs it, or the paper's."""
+        if name == "paper":
+            return PAPER
+        config = loaded.config
+        fps = config.decision.nominal_fps
+        return SimulatedTracker(tracker_settings(config.tracking, fps, acceleration=True))
+
+    @property
+    def name(self) -> TrackerName:
+        return "paper" if self.settings is None else "deployed"
+
+    def rule(self, decision: DecisionConfig) -> RuleSettings:
+        """The decision's parameters as this tracker's simulation has them."""
+        settings = rule_settings(decision)
+        if self.settings is not None:
+            return settings
+        return replace(settings, max_unseen_s=math.inf, count_all=True, shown=AS_RAW)
+
+
+PAPER = SimulatedTracker(None)
 
 
 @dataclass(frozen=True)
@@ -69,9 +110,7 @@ class TrackHistory:
         )
 
 
-def track(
-    sequences: Sequence[DetectionSequence], settings: TrackerSettings = SIMULATION_TRACKER
-) -> TrackHistory:
+def track(sequences: Sequence[DetectionSequence], use: SimulatedTracker) -> TrackHistory:
     """Runs the tracker over all sequences side by side."""
     batch = len(sequences)
     frames = np.asarray([len(s.xy_m) for s in sequences])
@@ -88,13 +127,17 @@ def track(
         detected = sequence.detected[:count]
         xy[at] = np.where(detected[..., None], sequence.xy_m[:count], 0.0)
         kind[at] = np.where(detected, sequence.kind, -1)
-    # In traffic few of all agents are there at a time: those who are come first.
-    order = np.argsort(kind < 0, axis=2, kind="stable")[
-        ..., : max(int((kind >= 0).sum(2).max()), 1)
-    ]
-    kind = np.take_along_axis(kind, order, 2)
-    xy = np.take_along_axis(xy, order[..., None], 2)
-    tracker = BatchTracker(settings, batch, slots=max(2 * order.shape[2], 4))
+    tracker: BatchTracker | PaperTracker
+    if use.settings is None:
+        tracker = PaperTracker(batch, agents, FPS)
+    else:
+        # In traffic few of all agents are there at a time: those who are come first.
+        order = np.argsort(kind < 0, axis=2, kind="stable")[
+            ..., : max(int((kind >= 0).sum(2).max()), 1)
+        ]
+        kind = np.take_along_axis(kind, order, 2)
+        xy = np.take_along_axis(xy, order[..., None], 2)
+        tracker = BatchTracker(use.settings, batch, slots=max(2 * order.shape[2], 4))
     history = _empty_history(longest, tracker)
     for frame in range(longest):
         tracker.update(frame / FPS, xy[frame], kind[frame])
@@ -128,7 +171,7 @@ def delay_history(history: TrackHistory, frames: int) -> TrackHistory:
     return replace(history, **arrays, delay_frames=history.delay_frames + frames)
 
 
-def _empty_history(frames: int, tracker: BatchTracker) -> dict[str, Any]:
+def _empty_history(frames: int, tracker: BatchTracker | PaperTracker) -> dict[str, Any]:
     """Arrays for every frame; made again, wider, when the tracker's slots have grown."""
     arrays = {name: getattr(tracker, name) for name in _STATE}
     return {name: np.zeros((frames, *a.shape), a.dtype) for name, a in arrays.items()}
@@ -224,13 +267,23 @@ def verdicts(run: RuleInput, settings: RuleSettings) -> PairChecks:
     return evaluate_rule(run.rows, run.pairs, settings)
 
 
-def states(
-    run: RuleInput, settings: RuleSettings
-) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
-    """Raw state codes of every frame, element after element."""
+@dataclass(frozen=True)
+class Outcome:
+    """State codes of every frame, element after element: the rule's own, and what is shown."""
+
+    raw: StateArray
+    states: StateArray
+
+
+def outcome(run: RuleInput, settings: RuleSettings) -> Outcome:
+    """What the rule says in every frame, and what the light shows of it."""
     fired = verdicts(run, settings).fires
     approaching = (
         np.bincount(run.rows.frame[run.pairs.pedestrian_row[fired]], minlength=len(run.time_s)) > 0
     )
     memory = is_remembered(run.time_s, run.cyclist_last_s, settings.memory_s)
-    return resolve_state(run.pedestrian, memory, approaching)
+    raw = resolve_state(run.pedestrian, memory, approaching)
+    if settings.shown == AS_RAW:
+        return Outcome(raw, raw)
+    shown = shown_alert(run.time_s, raw == int(State.ALERT), settings.shown, run.start)
+    return Outcome(raw, shown_states(raw, shown))

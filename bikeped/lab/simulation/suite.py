@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bikeped import __version__
-from bikeped.config.build import ground_camera, rule_settings
+from bikeped.config.build import ground_camera
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig
 from bikeped.geometry.camera import GroundCamera
@@ -22,9 +22,13 @@ from bikeped.lab.simulation.metrics import GroundTruthFrames, Metrics, measure
 from bikeped.lab.simulation.perception import SIMULATION_POSE, PerceptionResult, simulate_perception
 from bikeped.lab.simulation.simulate import (
     DetectionSequence,
+    Outcome,
     RuleInput,
+    SimulatedTracker,
+    TrackerName,
+    TrackHistory,
     build_rule_input,
-    states,
+    outcome,
     track,
 )
 from bikeped.lab.simulation.truth import GroundTruth, GroundTruthSettings, compute_ground_truth
@@ -56,6 +60,7 @@ CONFIGURATIONS: dict[str, DecisionConfig] = {
     ),
     "naive_closing": DecisionConfig(rule="naive"),
     "ttc": DecisionConfig(rule="ttc", min_displacement_m=0),
+    "predictive": DecisionConfig(rule="predictive"),
 }
 
 
@@ -65,12 +70,15 @@ class Suite:
 
     scenarios: tuple[Scenario, ...]
     camera: GroundCamera
+    tracker: SimulatedTracker
     pose: CameraPose = SIMULATION_POSE
     truth_settings: GroundTruthSettings = DEFAULT_GROUND_TRUTH
 
     @staticmethod
-    def load(scenarios: Sequence[Scenario], loaded: LoadedConfig) -> Suite:
-        return Suite(tuple(scenarios), ground_camera(loaded))
+    def load(
+        scenarios: Sequence[Scenario], loaded: LoadedConfig, tracker: TrackerName = "deployed"
+    ) -> Suite:
+        return Suite(tuple(scenarios), ground_camera(loaded), SimulatedTracker.of(loaded, tracker))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -113,28 +121,47 @@ class Suite:
         return self._rule_inputs[0]
 
     @cached_property
-    def _rule_inputs(self) -> tuple[RuleInput, RuleInput]:
+    def _histories(self) -> tuple[TrackHistory, TrackHistory]:
         """With and without localisation error, in one pass of the tracker."""
         count = len(self.scenarios)
-        history = track([*self.detection_sequences(True), *self.detection_sequences(False)])
-        parts = slice(0, count), slice(count, 2 * count)
-        with_error, without_error = (build_rule_input(history.select(part)) for part in parts)
-        return with_error, without_error
+        sequences = [*self.detection_sequences(True), *self.detection_sequences(False)]
+        history = track(sequences, self.tracker)
+        return history.select(slice(0, count)), history.select(slice(count, 2 * count))
+
+    @cached_property
+    def _rule_inputs(self) -> tuple[RuleInput, RuleInput]:
+        settings = self.tracker.rule(DecisionConfig())
+        first, second = (build_rule_input(part, 0, settings) for part in self._histories)
+        return first, second
+
+    def outcome(self, decision: DecisionConfig, localisation_error: bool = True) -> Outcome:
+        """Raw and shown states of every frame, scenario after scenario."""
+        rows = self.rule_input if localisation_error else self._rule_inputs[1]
+        settings = self.tracker.rule(decision)
+        if decision.max_unseen_s != DecisionConfig().max_unseen_s:  # others count
+            rows = build_rule_input(self._histories[not localisation_error], 0, settings)
+        return outcome(rows, settings)
 
     def states(
         self, decision: DecisionConfig, localisation_error: bool = True
     ) -> npt.NDArray[np.int8]:
-        """State codes of every frame, scenario after scenario."""
-        rows = self.rule_input if localisation_error else self._rule_inputs[1]
-        return states(rows, rule_settings(decision))
+        """State codes that the light shows in every frame, scenario after scenario."""
+        return self.outcome(decision, localisation_error).states
 
-    def measure(self, decision: DecisionConfig, localisation_error: bool = True) -> Metrics:
-        return measure(self.truth_frames, self.states(decision, localisation_error))
+    def measure(
+        self,
+        decision: DecisionConfig,
+        localisation_error: bool = True,
+        truth: GroundTruthFrames | None = None,
+    ) -> Metrics:
+        """The decision's metrics; `truth`: the same frames under other thresholds."""
+        found = self.outcome(decision, localisation_error)
+        return measure(truth or self.truth_frames, found.states, found.raw)
 
     def with_truth(self, settings: GroundTruthSettings) -> Suite:
         """The same suite under other thresholds; perception is not computed again."""
         other = replace(self, truth_settings=settings)
-        for name in ("perception_results", "_rule_inputs", "hash"):
+        for name in ("perception_results", "rule_input", "_histories", "_rule_inputs", "hash"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
@@ -176,6 +203,7 @@ def result_provenance(suite: Suite, loaded: LoadedConfig, seed: int) -> dict[str
         "version": __version__,
         "scenarios": len(suite.scenarios),
         "suite_hash": suite.hash,
+        "tracker": suite.tracker.name,
         "config_hash": loaded.hash,
         "calibration_hash": loaded.calibration_hash,
         "camera": camera_json(suite),

@@ -12,14 +12,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bikeped.config.build import rule_settings
 from bikeped.config.schema import DecisionConfig
-from bikeped.decision.decider import explain, pair_metrics, select_pair
+from bikeped.decision.decider import explain, pair_metrics, select_pair, shown_sentence
 from bikeped.decision.episodes import onsets
 from bikeped.decision.rules import PairChecks, is_remembered
 from bikeped.geometry.camera import GroundCamera
 from bikeped.lab.simulation.camera_pose import CameraPose
-from bikeped.lab.simulation.metrics import finite_or_none, measure
+from bikeped.lab.simulation.metrics import finite_or_none
 from bikeped.lab.simulation.simulate import FPS, verdicts
 from bikeped.lab.simulation.truth import ATTENTIVE_PRT_S, PEDESTRIAN_PRT_S, GroundTruth
 from bikeped.lab.testbench.runner import BenchSuite
@@ -154,26 +153,28 @@ def _closest(truth: GroundTruth) -> float:
 
 def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) -> dict[str, Any]:
     """One decision on the scenario: states, sentences and numbers of every frame."""
-    run, settings = suite.rule_input, rule_settings(decision)
+    run, settings = suite.rule_input, suite.tracker.rule(decision)
     frames = run.frame_slice(index)
-    codes = suite.states(decision)
+    shown = suite.outcome(decision)
+    codes = shown.states
     found = verdicts(run, settings)
-    own = codes[frames]
+    own, raw = codes[frames], shown.raw[frames]
     truth = suite.truths[index]
     pair_frame = run.rows.frame[run.pairs.pedestrian_row]
     start = np.searchsorted(pair_frame, np.arange(frames.start, frames.stop + 1))
-    walking = run.rows.frame[run.rows.kind == int(Kind.PEDESTRIAN)]
+    walking = run.rows.frame[run.rows.counts & (run.rows.kind == int(Kind.PEDESTRIAN))]
     pedestrians = np.bincount(walking, minlength=frames.stop)[frames]
     since = run.time_s[frames] - run.cyclist_last_s[frames]
     sentences, chosen = [], []
     for i in range(len(own)):
         part = slice(int(start[i]), int(start[i + 1]))
-        state = State(int(own[i]))
+        state = State(int(raw[i]))
         at = select_pair(state, found.fires[part], found.distance_m[part])
         pair = None
         if at is not None:
             pair = pair_metrics(part.start + at, run.rows, run.pairs, found, settings)
-        sentences.append(explain(state, pair, int(pedestrians[i]), float(since[i]), settings))
+        sentence = explain(state, pair, int(pedestrians[i]), float(since[i]), settings)
+        sentences.append(shown_sentence(state, State(int(own[i])), sentence, settings))
         chosen.append(-1 if at is None else part.start + at - int(start[0]))
     alert = own == int(State.ALERT)
     return {
@@ -182,6 +183,7 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
         "memory_s": settings.memory_s,
         "lookback_s": settings.lookback_s,
         "state": own.tolist(),
+        "raw_state": raw.tolist(),
         "sentence": sentences,
         "chosen": chosen,
         "pedestrians": pedestrians.tolist(),
@@ -199,7 +201,7 @@ def _side(suite: BenchSuite, index: int, name: str, decision: DecisionConfig) ->
             }
             for i in np.flatnonzero(onsets(alert))
         ],
-        "metrics": measure(suite.truth_frames, codes).scenario_dict(index),
+        "metrics": suite.measure(decision).scenario_dict(index),
         "counts": _counts(truth, alert),
     }
 

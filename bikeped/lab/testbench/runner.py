@@ -17,6 +17,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from bikeped.config.load import LoadedConfig
+from bikeped.config.schema import DecisionConfig
 from bikeped.errors import BikepedError
 from bikeped.lab.experiments.deployment import fuse_cameras
 from bikeped.lab.experiments.trials import (
@@ -32,6 +33,8 @@ from bikeped.lab.simulation.perception import PerceptionResult, RecallModel, sim
 from bikeped.lab.simulation.simulate import (
     DetectionSequence,
     RuleInput,
+    SimulatedTracker,
+    TrackerName,
     TrackHistory,
     build_rule_input,
     delay_history,
@@ -96,7 +99,7 @@ class BenchSuite(Suite):
 
     @cached_property
     def track_history(self) -> TrackHistory:
-        found = track(self.shown_detections)
+        found = track(self.shown_detections, self.tracker)
         # Without misses the delay is in the scenes, as `conformance latency` has it; with them the
         # trial is tracked once and comes late, as `conformance montecarlo` and the sweep do.
         return found if self.perception.model() is None else delay_history(found, self.delay.frames)
@@ -104,7 +107,9 @@ class BenchSuite(Suite):
     @cached_property
     def rule_input(self) -> RuleInput:
         """Track rows as the rules read them, under this perception and delay."""
-        return build_rule_input(self.track_history, self.delay.order)
+        return build_rule_input(
+            self.track_history, self.delay.order, self.tracker.rule(DecisionConfig())
+        )
 
     def with_truth(self, settings: GroundTruthSettings) -> BenchSuite:
         """The same suite under other thresholds; perception is not computed again."""
@@ -134,7 +139,13 @@ def trial_summaries(suite: BenchSuite, bench: BenchSettings) -> dict[str, Any] |
     case = (bench.delay.frames, bench.delay.order)
     plan = LossModel(model, bench.perception.burst_frames, (case,))
     found = simulate_trials(
-        observed, truth, plan, {"": bench.decision}, range(trials), bench.perception.seed
+        observed,
+        truth,
+        plan,
+        {"": bench.decision},
+        range(trials),
+        bench.perception.seed,
+        suite.tracker,
     )
     return {"trials": trials, **summarize_metrics(found[case][""])}
 
@@ -153,8 +164,10 @@ def check_work(scenarios: Sequence[Scenario], repeats: int = 1) -> None:
 class BenchRunner:
     """Runs the suite under changing settings and caches what they share. Thread-safe by a lock."""
 
-    def __init__(self, loaded: LoadedConfig, scenarios: Sequence[Scenario]) -> None:
-        self.loaded, self.scenarios = loaded, tuple(scenarios)
+    def __init__(
+        self, loaded: LoadedConfig, scenarios: Sequence[Scenario], tracker: TrackerName = "deployed"
+    ) -> None:
+        self.loaded, self.scenarios, self.tracker = loaded, tuple(scenarios), tracker
         self._texts = {id(s): dump_scenario(s) for s in self.scenarios}
         self._seen: _LruCache[PerceptionResult] = _LruCache(400)
         self._truths: _LruCache[GroundTruth] = _LruCache(400)
@@ -195,7 +208,14 @@ class BenchRunner:
 
             def make() -> BenchSuite:
                 suite = BenchSuite(
-                    scenarios, camera, pose, GroundTruthSettings(), perception, bench.delay, second
+                    scenarios,
+                    camera,
+                    SimulatedTracker.of(self.loaded, self.tracker),
+                    pose,
+                    GroundTruthSettings(),
+                    perception,
+                    bench.delay,
+                    second,
                 )
                 suite.__dict__["perception_results"] = tuple(
                     self._seen.get(

@@ -78,7 +78,7 @@ def traffic_result(
         "scenes": len(suite.scenes),
         "hours": sum(len(light.raw) for light in lights[FORESIGHT]) / FPS / 3600,
         "hours_both_in_view": hours_both_in_view(lights[FORESIGHT]),
-        "tracker": "deployed",
+        "tracker": suite.tracker.name,
         "noise": suite.noise,
         "seed": suite.seed,
         "shown": {

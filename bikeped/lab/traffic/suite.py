@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.config.build import ground_camera, rule_settings, tracker_settings
+from bikeped.config.build import ground_camera
 from bikeped.config.load import LoadedConfig
 from bikeped.config.schema import DecisionConfig
 from bikeped.decision.rules import is_remembered, resolve_state
@@ -35,13 +35,14 @@ from bikeped.lab.simulation.simulate import (
     FPS,
     DetectionSequence,
     RuleInput,
+    SimulatedTracker,
+    TrackerName,
     build_rule_input,
-    states,
+    outcome,
     track,
 )
 from bikeped.lab.simulation.truth import KIND_OF, GroundTruth, compute_ground_truth
 from bikeped.lab.traffic.readers import TrafficScene
-from bikeped.tracking.batch_tracker import TrackerSettings
 from bikeped.types import BoolArray, FloatArray, Kind, State
 
 #: `located`: localisation error, and no detection missed.
@@ -64,7 +65,7 @@ class TrafficSuite:
 
     scenes: tuple[TrafficScene, ...]
     camera: GroundCamera
-    tracker: TrackerSettings
+    tracker: SimulatedTracker
     noise: Noise = "realistic"
     seed: int = 0
     view_m: float | None = VIEW_M
@@ -73,11 +74,15 @@ class TrafficSuite:
 
     @staticmethod
     def load(
-        scenes: Sequence[TrafficScene], loaded: LoadedConfig, noise: Noise, seed: int
+        scenes: Sequence[TrafficScene],
+        loaded: LoadedConfig,
+        noise: Noise,
+        seed: int,
+        tracker: TrackerName = "deployed",
     ) -> TrafficSuite:
         """The scenes before the configured camera, with the configuration's tracker."""
-        tracker = tracker_settings(loaded.config.tracking, loaded.config.decision.nominal_fps)
-        return TrafficSuite(tuple(scenes), ground_camera(loaded), tracker, noise, seed)
+        use = SimulatedTracker.of(loaded, tracker)
+        return TrafficSuite(tuple(scenes), ground_camera(loaded), use, noise, seed)
 
     @staticmethod
     def of_scenarios(
@@ -163,12 +168,12 @@ class TrafficSuite:
 
     def lights(self, decision: DecisionConfig) -> list[LightRecord]:
         """What the light does in every scene under a decision."""
-        settings = rule_settings(decision)
-        return self.records(states(self.rule_input, settings), settings.shown)
+        settings = self.tracker.rule(decision)
+        return self.records(outcome(self.rule_input, settings).raw, settings.shown)
 
     def foresight(self, decision: DecisionConfig) -> list[LightRecord]:
         """The light that knows danger itself, with the decision's window, hold and memory."""
-        settings = rule_settings(decision)
+        settings = self.tracker.rule(decision)
         raw = []
         for truth, (cyclist, pedestrian) in zip(self.truths, self.present, strict=True):
             last_s = np.maximum.accumulate(np.where(cyclist, truth.time_s, -np.inf))

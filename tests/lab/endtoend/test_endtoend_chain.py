@@ -87,7 +87,7 @@ def test_the_loop_and_the_ablation_decide_alike(
         loaded, cyclist_box_includes_rider=run.cyclist_box_includes_rider
     )
     again = states_from_boxes(track_and_decide, run, lambda r, f: r.detections[f])
-    np.testing.assert_array_equal(again, run.state)
+    np.testing.assert_array_equal(again, [run.state, run.raw_state])
 
 
 def test_measures_of_a_perfect_detector(
@@ -114,6 +114,7 @@ def test_an_eye_that_sees_nothing_is_named(
         run,
         detections=tuple(Detections.empty() for _ in run.detections),
         state=np.zeros_like(run.state),
+        raw_state=np.zeros_like(run.state),
     )
     suite = Suite.load([scenario], loaded)
     steps = run_ablation(suite, [blind], loaded, loaded.config.decision)

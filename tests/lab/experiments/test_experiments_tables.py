@@ -95,7 +95,10 @@ def test_truth_rows_vary_one_threshold_each(suite: Suite) -> None:
     assert danger[3] > danger[4] > danger[5] or danger[3] >= danger[4] >= danger[5]
     # The straightforward way: a suite made afresh under the thresholds.
     fresh = Suite(
-        suite.scenarios, suite.camera, truth_settings=ex.GroundTruthSettings(stopping_margin=0.6)
+        suite.scenarios,
+        suite.camera,
+        suite.tracker,
+        truth_settings=ex.GroundTruthSettings(stopping_margin=0.6),
     )
     alone = fresh.measure(SELECTED).as_dict()
     assert {key: rows[3][key] for key in alone} == alone
@@ -228,13 +231,13 @@ def test_fusion(suite: Suite) -> None:
 
 
 def test_deployment_rows(suite: Suite) -> None:
-    data = dep.deployment(suite.camera, SELECTED, trials=6).data
+    data = dep.deployment(suite.camera, suite.tracker, SELECTED, trials=6).data
     json.dumps(data, allow_nan=False)
     keys = [(r["height_m"], r["cameras"], r["width_ft"]) for r in data["rows"]]
     assert keys == [(h, c, w) for h in (5.5, 2.5) for c in (1, 2) for w in (30, 40, 50, 60)]
     for one, two in zip(data["rows"][:4], data["rows"][4:8], strict=True):
         assert two["sensitivity"]["mean"] > one["sensitivity"]["mean"]
-    assert dep.deployment(suite.camera, SELECTED, trials=6).data == data
+    assert dep.deployment(suite.camera, suite.tracker, SELECTED, trials=6).data == data
 
 
 def test_placement_grid(suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,14 +246,14 @@ def test_placement_grid(suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
     assert dep.PITCHES_DEG == (0, -10, -20, -30, -40, -50, -60, -70, -80, -90)
     monkeypatch.setattr(dep, "HEIGHTS_M", (1.5, 5.5))
     monkeypatch.setattr(dep, "PITCHES_DEG", (0.0, -40.0, -90.0))
-    data = dep.placement(suite.camera, SELECTED, trials=3).data
+    data = dep.placement(suite.camera, suite.tracker, SELECTED, trials=3).data
     assert [len(row) for row in data["sensitivity"]] == [3, 3]
     # A cell is the deployment of that mount, the same trials.
     monkeypatch.setattr(dep, "MOUNTS", ((5.5, -40.0),))
     monkeypatch.setattr(dep, "WIDTHS_FT", (40,))
-    rows = dep.deployment(suite.camera, SELECTED, trials=3).data["rows"]
+    rows = dep.deployment(suite.camera, suite.tracker, SELECTED, trials=3).data["rows"]
     assert data["sensitivity"][1][1] == rows[0]["sensitivity"]["mean"]
-    shown = dep.placement(suite.camera, SELECTED, trials=3).tables[1]
+    shown = dep.placement(suite.camera, suite.tracker, SELECTED, trials=3).tables[1]
     assert shown.name == "placement_visible_only"
     assert all(
         v is None or u is None or v <= u + 0.2

@@ -115,7 +115,7 @@ def test_provenance_names_what_the_promotion_rests_on(place):
         (("  height_m: 3.6576", "  height_m: 3.6576\n  crop_size: 3499"), "the camera or"),
         (("  height_m: 3.6576", "  height_m: 3.6576\n  table_step_px: 9"), "the camera or"),
         (
-            ("feedback:", "tracking:\n  acceleration_cyclist_mps2: 5.0\nfeedback:"),
+            ("feedback:", "tracking:\n  acceleration_cyclist_mps2: 4.5\nfeedback:"),
             "the tracking section",
         ),
         (("feedback:", "latency:\n  compensation: measured\nfeedback:"), "the latency section"),

@@ -261,7 +261,7 @@ def test_the_audit_says_what_the_suite_says(tmp_path, suite, loaded):
     assert [f["state"] for f in frames] == [State(int(s)).name for s in states]
     assert [f["danger"] for f in frames] == suite.truth_frames.danger.tolist()
     assert [f["actionable"] for f in frames] == suite.truth_frames.actionable.tolist()
-    assert all((f["alert_tracks"] is not None) == (f["state"] == "ALERT") for f in frames)
+    assert all((f["alert_tracks"] is not None) == (f["raw_state"] == "ALERT") for f in frames)
     for frame in frames[:: len(frames) // 7]:
         lane = suite.names.index(frame["scenario"])
         for agent in frame["agents"]:

@@ -1,11 +1,14 @@
 """The 24 scenarios themselves: plausible, named as documented, with the dangers they promise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bikeped.config.build import rule_settings
 from bikeped.lab.scenarios.scenario import HAZARDS, SIZES_M, bundled_folder, load_scenarios
 from bikeped.lab.simulation.perception import SIMULATION_POSE
+from bikeped.lab.simulation.simulate import PAPER
 from bikeped.lab.simulation.suite import CONFIGURATIONS, compare
 from bikeped.types import State
 
@@ -42,6 +45,12 @@ def speeds(agent):
     velocity = (agent.sample(t + STEP_S)[0] - agent.sample(t)[0]) / STEP_S
     lag = round(60 * STEP_S)
     return np.hypot(*velocity.T), np.hypot(*(velocity[lag:] - velocity[:-lag]).T) / STEP_S
+
+
+@pytest.fixture(scope="module")
+def paper(suite):
+    """The suite as the paper simulates it: the raw state, by its own tracker."""
+    return replace(suite, tracker=PAPER)
 
 
 def of(suite, name, values):
@@ -124,28 +133,28 @@ def test_occluded_emergence_appears_within_nine_metres(suite):
 
 
 @pytest.mark.parametrize("error", [True, False])
-def test_parallel_paths_never_alert_under_the_pairwise_rule(suite, error):
+def test_parallel_paths_never_alert_under_the_pairwise_rule(paper, error):
     runner, rider = (a.path for a in SCENARIOS["Parallel Paths"].agents)
     assert np.ptp(runner[:, 1:] - rider[:, 1:], axis=0) == pytest.approx([0, 0], abs=1e-12)
     for configuration in PAIRWISE:
-        assert not alerts(suite, "Parallel Paths", configuration, error).any()
+        assert not alerts(paper, "Parallel Paths", configuration, error).any()
     # And not for want of movement, or of a distance within the bounds: the naive rule alerts.
-    assert alerts(suite, "Parallel Paths", "naive_closing", error).mean() > 0.9
+    assert alerts(paper, "Parallel Paths", "naive_closing", error).mean() > 0.85
 
 
 @pytest.mark.parametrize("error", [True, False])
-def test_swerving_cyclist_shows_an_onset_at_the_closest_approach(suite, error):
-    alert = alerts(suite, "Swerving Cyclist", "selected", error)
+def test_swerving_cyclist_shows_an_onset_at_the_closest_approach(paper, error):
+    alert = alerts(paper, "Swerving Cyclist", "selected", error)
     onset = np.nonzero(alert[1:] & ~alert[:-1])[0] + 1
-    budget = of(suite, "Swerving Cyclist", suite.truth_frames.budget_s)[onset]
+    budget = of(paper, "Swerving Cyclist", paper.truth_frames.budget_s)[onset]
     assert budget.min() <= 0.1
     assert budget[0] > 2.0  # the straight approach is warned of in time
 
 
-def test_nobody_but_the_swerving_cyclist_gets_less_than_an_attentive_walker_needs(suite):
-    metrics = suite.measure(CONFIGURATIONS["selected"])
+def test_nobody_but_the_swerving_cyclist_gets_less_than_an_attentive_walker_needs(paper):
+    metrics = paper.measure(CONFIGURATIONS["selected"])
     short = metrics.by_scenario["min_warning_budget_s"] < 0.84
-    assert {n for n, s in zip(suite.names, short, strict=True) if s} == {"Swerving Cyclist"}
+    assert {n for n, s in zip(paper.names, short, strict=True) if s} == {"Swerving Cyclist"}
 
 
 def test_the_expected_state_dominates(suite):
@@ -182,7 +191,7 @@ def test_rules_read_the_configurations_as_defined():
     rows = {
         n: (c.memory_frames, c.d_min_m, c.d_max_m, c.min_displacement_m, c.lookback_frames,
             c.speed_adaptive, c.rule)
-        for n, c in CONFIGURATIONS.items()
+        for n, c in CONFIGURATIONS.items() if n != "predictive"
     }  # fmt: skip
     assert rows == {
         "selected": (58, 1.9, 24.8, 0.147, 2, True, "pairwise"),

@@ -17,7 +17,7 @@ from bikeped.config.load import load_config
 from bikeped.decision.decider import Decider
 from bikeped.decision.who_counts import counts
 from bikeped.lab.scenarios.scenario import bundled_folder, load_scenarios
-from bikeped.lab.simulation.simulate import FPS, SIMULATION_TRACKER
+from bikeped.lab.simulation.simulate import FPS, SimulatedTracker
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.tracking.tracker import Tracker
 from bikeped.types import GroundPoints
@@ -30,7 +30,7 @@ REMEDY = "if the change is meant: python tests/lab/simulation/test_simulation_go
 
 def trace(name, scene):
     """The golden text of one scene, by the deployed tracker and decider."""
-    tracker = Tracker(SIMULATION_TRACKER)
+    tracker = Tracker(SimulatedTracker.of(load_config(None)).settings)
     decider = Decider(rule_settings(CONFIGURATIONS["selected"]))
     stretches = []
     for frame, there in enumerate(scene.detected):

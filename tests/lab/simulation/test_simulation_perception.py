@@ -230,4 +230,4 @@ def test_without_localisation_error_there_is_none(suite):
         assert np.array_equal(b.xy_m, seen.true_m, equal_nan=True)
         assert not np.array_equal(a.xy_m, b.xy_m, equal_nan=True)
     selected = CONFIGURATIONS["selected"]
-    assert suite.measure(selected, True).sensitivity != suite.measure(selected, False).sensitivity
+    assert suite.measure(selected, True).specificity != suite.measure(selected, False).specificity

@@ -7,16 +7,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bikeped.config.build import rule_settings
 from bikeped.lab.scenarios.scenario import SIZES_M, Agent, Scenario
 from bikeped.lab.simulation.camera_pose import CameraPose
 from bikeped.lab.simulation.perception import SIMULATION_POSE
-from bikeped.lab.simulation.simulate import DetectionSequence, build_rule_input, states, track
+from bikeped.lab.simulation.simulate import (
+    PAPER,
+    DetectionSequence,
+    build_rule_input,
+    outcome,
+    track,
+)
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.lab.simulation.truth import compute_ground_truth
 from bikeped.types import State
 
 ALERT = int(State.ALERT)
+RULE = PAPER.rule(CONFIGURATIONS["selected"])
 PAIRWISE = [n for n, c in CONFIGURATIONS.items() if c.rule == "pairwise"]
 AT = np.array([SIMULATION_POSE.x_m, SIMULATION_POSE.y_m])
 QUICK = settings(derandomize=True, deadline=None, max_examples=30)
@@ -57,12 +63,12 @@ def lanes(scenarios):
         codes = {"pedestrian": 0, "cyclist": 1}
         kind = np.array([codes.get(a.kind, 2) for a in scenario.agents], np.int8)
         scenes.append(DetectionSequence(xy, there, kind))
-    return build_rule_input(track(scenes))
+    return build_rule_input(track(scenes, PAPER), 0, RULE)
 
 
 def decided(scenarios, configuration="selected"):
     run = lanes(scenarios)
-    found = states(run, rule_settings(CONFIGURATIONS[configuration]))
+    found = outcome(run, PAPER.rule(CONFIGURATIONS[configuration])).raw
     return [found[run.frame_slice(i)].tolist() for i in range(len(scenarios))]
 
 
@@ -81,7 +87,7 @@ def test_the_mirrored_street_is_as_dangerous_and_decided_alike(suite):
 
 @pytest.mark.parametrize("frames", [1, 17, 300])
 def test_a_clock_that_began_earlier_shifts_states_and_truth(suite, frames):
-    moved = Suite(tuple(later(s, frames) for s in suite.scenarios), suite.camera)
+    moved = Suite(tuple(later(s, frames) for s in suite.scenarios), suite.camera, suite.tracker)
     for error in (True, False):
         config = CONFIGURATIONS["selected"]
         before, after = suite.states(config, error), moved.states(config, error)
@@ -101,7 +107,7 @@ def test_the_order_of_agents_in_a_file_changes_no_state(suite, seed):
         replace(s, agents=tuple(s.agents[i] for i in rng.permutation(len(s.agents))))
         for s in suite.scenarios
     )
-    other = Suite(shuffled, suite.camera)
+    other = Suite(shuffled, suite.camera, suite.tracker)
     for config in CONFIGURATIONS.values():
         assert other.states(config).tolist() == suite.states(config).tolist()
     for a, b in zip(suite.truths, other.truths, strict=True):
@@ -111,7 +117,7 @@ def test_the_order_of_agents_in_a_file_changes_no_state(suite, seed):
 
 
 def test_the_order_of_scenarios_changes_no_state(suite):
-    reverse = Suite(suite.scenarios[::-1], suite.camera)
+    reverse = Suite(suite.scenarios[::-1], suite.camera, suite.tracker)
     config = CONFIGURATIONS["selected"]
     parts = [
         reverse.states(config)[reverse.truth_frames.scenario == i] for i in range(len(suite.names))

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -14,7 +13,6 @@ from testbench_fakes import BASE, LOADED, OWN, SCENARIOS, bench, pages
 from bikeped.config.build import rule_settings
 from bikeped.config.schema import DecisionConfig
 from bikeped.decision.decider import Decider
-from bikeped.decision.shown import AS_RAW
 from bikeped.lab.experiments.latency import sweep
 from bikeped.lab.experiments.trials import (
     LossModel,
@@ -136,15 +134,24 @@ def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
     one = work.shown_suite(bench(name))
     play = playback(one, 0, {rule: decision})
     side = play["sides"][0]
-    decider = Decider(replace(rule_settings(decision), shown=AS_RAW))
+    decider = Decider(rule_settings(decision))
     rows = one.rule_input.rows
     for frame in range(play["frames"]):
         at = rows.frame == frame
-        told = decider.decide(frame / 30, rows.id[at], rows.kind[at], rows.xy_m[at])
+        told = decider.decide(
+            frame / 30,
+            rows.id[at],
+            rows.kind[at],
+            rows.xy_m[at],
+            rows.velocity_mps[at],
+            rows.counts[at],
+        )
         assert side["sentence"][frame] == told.sentence
         assert State(side["state"][frame]) is told.state
         chosen = side["chosen"][frame]
         pairs = side["pairs"]
+        if told.held:
+            continue  # the pair is that of an earlier frame
         if told.pair is None:
             assert chosen == -1
         else:

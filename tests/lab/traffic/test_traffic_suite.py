@@ -10,7 +10,7 @@ from traffic_scenes import BUNDLED, write_traffic
 from bikeped.config.build import rule_settings
 from bikeped.config.load import load_config
 from bikeped.lab.simulation.camera_pose import CameraPose, CameraView
-from bikeped.lab.simulation.simulate import DetectionSequence, build_rule_input, states, track
+from bikeped.lab.simulation.simulate import DetectionSequence, build_rule_input, outcome, track
 from bikeped.lab.simulation.suite import CONFIGURATIONS, Suite
 from bikeped.lab.traffic.readers import TrafficScene, read_scene, read_traffic
 from bikeped.lab.traffic.result import with_alert_settings
@@ -66,7 +66,7 @@ def test_states_are_those_of_the_scenario_simulation(traffic):
     seen = traffic.perception_results
     sequences = [DetectionSequence(s.true_m, s.present, s.kind) for s in seen]
     history = track(sequences, traffic.tracker)
-    expected = states(build_rule_input(history), rule_settings(SELECTED))
+    expected = outcome(build_rule_input(history), rule_settings(SELECTED)).raw
     found = np.concatenate([light.raw for light in traffic.lights(SELECTED)])
     np.testing.assert_array_equal(found, expected)
     assert (found == int(State.ALERT)).any()
