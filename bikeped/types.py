@@ -215,7 +215,8 @@ class PairMetrics:
 
 @dataclass(frozen=True)
 class Decision:
-    """The state at `time_s`, with the reason in one line for a resident.
+    """The state at `time_s`, with the reason in one line for a resident, and in `detail` the test's
+    numbers.
 
     `raw` is the rule's own state of this frame, `state` what is shown of it: ALERT only when the
     rule is sure of it, and then for a while (definitions, section 14).
@@ -226,6 +227,7 @@ class Decision:
     sentence: str
     pair: PairMetrics | None = None  #: the first that fires (ALERT) or the nearest (WARNING)
     raw: State | None = None  #: None: as shown
+    detail: str = ""
 
     @property
     def held(self) -> bool:

@@ -1,7 +1,8 @@
 """The fault campaign: injects faults against the real service and writes docs/faults.md.
 
-`scripts/faults` runs all rows, `scripts/faults 1 9 13` some; the page is written when all ran. Ends
-with 1 when a row fails that this campaign is to pass.
+`scripts/faults` runs all rows, `scripts/faults 1 9 13` some; the page is written when all ran, in
+this run or in those whose figures `--also` names. Ends with 1 when a row fails that this campaign
+is to pass.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -28,6 +30,7 @@ def main() -> int:
     parser.add_argument("numbers", nargs="*", type=int, metavar="N", help="rows; all without")
     parser.add_argument("--repeat", type=int, metavar="K", help="repetitions of each row")
     parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--also", type=Path, nargs="+", default=(), help="figures of other runs")
     parser.add_argument("--page", type=Path, help="write the page here, whatever ran")
     arguments = parser.parse_args()
     unknown = [number for number in arguments.numbers if number not in known]
@@ -35,12 +38,19 @@ def main() -> int:
         parser.error(f"no row {unknown[0]}; rows are 1 to {max(known)}")
     console = Console()
     rows = [known[number] for number in arguments.numbers or known]
-    results = runner.run(rows, arguments.repeat, console)
+    results: list[Any] | None = [] if arguments.also and not arguments.numbers else None
+    if results is None:
+        results = runner.run(rows, arguments.repeat, console)
+    ran = {result.row.number for result in results}
+    for path in arguments.also:
+        found = runner.from_figures(known, json.loads(path.read_text(encoding="utf-8")))
+        results += [result for result in found if result.row.number not in ran]
+    results.sort(key=lambda result: result.row.number)
     console.print(runner.table(results))
     if arguments.json:
         text = json.dumps(runner.figures(results), indent=2)
         arguments.json.write_text(text + "\n", encoding="utf-8")
-    if arguments.page or not arguments.numbers:
+    if arguments.page or {result.row.number for result in results} == set(known):
         runner.write_page(results, arguments.page or ROOT / "docs" / "faults.md")
     failed = runner.failed(results)
     if failed:

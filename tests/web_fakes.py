@@ -101,6 +101,7 @@ def health(**changes: Any) -> HealthMessage:
             mqtt_dropped=0,
             audit_dropped=0,
         ),
+        "instance": "3f9a1c0b",
     }
     return HealthMessage(**{**values, **changes})
 

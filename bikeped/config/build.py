@@ -51,6 +51,7 @@ def rule_settings(decision: DecisionConfig, speed_window_frames: int = 4) -> Rul
             pass_growth_mps=decision.pass_growth_mps,
             stopping_share=decision.stopping_share,
             contact_within_s=decision.contact_within_s,
+            least_ahead_s=decision.least_ahead_s,
             stay_margin=decision.stay_margin,
         ),
         shown=ShownSettings(

@@ -209,7 +209,7 @@ class DecisionConfig(Section, frozen=True):
 
     rule: Literal["pairwise", "naive", "ttc", "distance", "predictive"] = "pairwise"
     """closing check: the paper's pairwise one, a baseline, or bikeped's own, predictive, which asks
-    for the seven keys from least_closing_mps on, and not for d_min_m to speed_adaptive"""
+    for the eight keys from least_closing_mps on, and not for d_min_m to speed_adaptive"""
     memory_frames: Annotated[int, Meta(ge=0, le=3000)] = 58
     """N: a cyclist is remembered this many nominal frames; 0, the paper's rule without memory, is
     for conformance only: `bikeped run` refuses it"""
@@ -231,19 +231,21 @@ class DecisionConfig(Section, frozen=True):
     """cyclist's deceleration in the stopping distance, m/s^2"""
     ttc_s: Annotated[float, Meta(gt=0, le=60)] = 3.0
     """time to collision below which rule ttc fires, s"""
-    least_closing_mps: Annotated[float, Meta(ge=0, le=10)] = 0.7
+    least_closing_mps: Annotated[float, Meta(ge=0, le=10)] = 0.35
     """rule predictive: slower than this, two do not close in: below a walker's own speed, m/s"""
-    least_cycling_mps: Annotated[float, Meta(ge=0, le=10)] = 1.0
+    least_cycling_mps: Annotated[float, Meta(ge=0, le=10)] = 1.8
     """rule predictive: who rides slower could stop at once, m/s"""
-    pass_within_m: Annotated[float, Meta(ge=0, le=25)] = 7.5
+    pass_within_m: Annotated[float, Meta(ge=0, le=25)] = 7.8
     """rule predictive: a pass this near may yet become a contact by a turn, m"""
-    pass_growth_mps: Annotated[float, Meta(ge=0, le=5)] = 0.4
+    pass_growth_mps: Annotated[float, Meta(ge=0, le=5)] = 0.65
     """rule predictive: so much wider a second of time to the pass, which is less sure then, m/s"""
-    stopping_share: Annotated[float, Meta(gt=0, le=2)] = 0.5
+    stopping_share: Annotated[float, Meta(gt=0, le=2)] = 0.55
     """rule predictive: the cyclist's stopping distance is over this share of the gap"""
-    contact_within_s: Annotated[float, Meta(gt=0, le=10)] = 5.0
+    contact_within_s: Annotated[float, Meta(gt=0, le=10)] = 5.2
     """rule predictive: or contact, at this closing speed, is nearer than this, s"""
-    stay_margin: Annotated[float, Meta(ge=0, le=0.9)] = 0.3
+    least_ahead_s: Annotated[float, Meta(ge=0, le=1)] = 0.3
+    """rule predictive: the pass is later than this: the hold covers what is nearer, s"""
+    stay_margin: Annotated[float, Meta(ge=0, le=0.9)] = 0.1
     """rule predictive: an alert stays on while all this holds with numbers wider by this share"""
     max_unseen_s: Annotated[float, Meta(ge=0, le=2)] = 1.0
     """a track counts, as present, in memory and in a pair, only while seen within this time, s"""

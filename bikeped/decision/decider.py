@@ -73,11 +73,12 @@ class Decider:
         if raw is State.ALERT:
             self._alert_pair = pair
         state = State(shown_states(np.asarray(raw), np.asarray(shown)).item())
-        sentence = explain(raw, pair, pedestrians, since_s, self.settings)
-        sentence = shown_sentence(raw, state, sentence, self.settings)
+        detail = explain(raw, pair, pedestrians, since_s, self.settings)
+        detail = shown_sentence(raw, state, detail, self.settings)
+        sentence = plain_sentence(raw, state, pair, pedestrians, since_s)
         if state is State.ALERT and raw is not State.ALERT:
             pair = self._alert_pair
-        return Decision(time_s, state, sentence, pair, raw)
+        return Decision(time_s, state, sentence, pair, raw, detail)
 
 
 def select_pair(state: State, fires: BoolArray, distance_m: FloatArray) -> int | None:
@@ -112,6 +113,34 @@ def pair_metrics(
     )
 
 
+#: What is said of a course: closing faster than this, and together within so many seconds.
+_CLOSING_MPS, _SOON_S = 0.3, 9.0
+
+
+def plain_sentence(
+    raw: State, state: State, pair: PairMetrics | None, pedestrians: int, since_cyclist_s: float
+) -> str:
+    """What a resident sees, and why the light shows `state`; the test's numbers: `explain`."""
+    if state is State.ALERT and raw is not State.ALERT:
+        return "ALERT: it stays red for a moment after the danger."
+    if raw is State.IDLE:
+        return "IDLE: no pedestrian is in view."
+    people = "1 pedestrian is" if pedestrians == 1 else f"{pedestrians} pedestrians are"
+    if raw is State.SAFE:
+        return f"SAFE: {people} in view, and no cyclist."
+    if pair is None:
+        return f"WARNING: {people} in view, and a cyclist was there {since_cyclist_s:.1f} s ago."
+    both = f"a cyclist and a pedestrian are {pair.distance_m:.0f} m apart"
+    course = "and not closing"
+    if pair.closing_mps > _CLOSING_MPS:
+        course = "and closing"
+        if pair.contact_s < _SOON_S:
+            course += f"; together in {pair.contact_s:.1f} s"
+    if raw is State.WARNING:
+        course = course.replace("and closing", "and closing, but not into danger", 1)
+    return f"{state.name}: {both} {course}."
+
+
 def explain(
     state: State,
     pair: PairMetrics | None,
@@ -119,7 +148,7 @@ def explain(
     since_cyclist_s: float,
     settings: RuleSettings,
 ) -> str:
-    """The decision and its numbers in one line for a resident."""
+    """The decision and the numbers that the rule compared, in one line."""
     if state is State.IDLE:
         return "IDLE: no pedestrian is tracked."
     people = "1 pedestrian is" if pedestrians == 1 else f"{pedestrians} pedestrians are"
@@ -135,6 +164,13 @@ def explain(
     pair_text = f"cyclist {pair.cyclist_id} and pedestrian {pair.pedestrian_id}"
     gap = f"{pair.distance_m:.2f} m apart"
     past = f"were {pair.distance_then_m:.2f} m {pair.lookback_s:.2f} s ago"
+    if settings.rule == "predictive":
+        contact = f"{pair.contact_s:.1f} s" if pair.contact_s < _SOON_S else "not soon"
+        return (
+            f"{state.name}: {pair_text} are {gap}, closing at {pair.closing_mps:.1f} m/s; contact: "
+            f"{contact}; going on so they pass {pair.pass_m:.1f} m apart in {pair.pass_s:.1f} s; "
+            f"the cyclist rides at {pair.speed_mps:.1f} m/s (rule predictive)."
+        )
     if state is State.ALERT:
         moved = f"the cyclist moved {pair.displacement_m:.2f} m at {pair.speed_mps:.1f} m/s"
         bounds = f"{pair.d_min_m:g} to {pair.d_max_m:.1f} m"

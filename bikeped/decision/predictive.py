@@ -28,13 +28,14 @@ _STANDS_MPS = 1e-3
 class PredictiveSettings:
     """The rule's numbers, in metres and seconds; docs/rule.md has the reasons and the search."""
 
-    least_closing_mps: float = 0.7
-    least_cycling_mps: float = 1.0
-    pass_within_m: float = 7.5
-    pass_growth_mps: float = 0.4
-    stopping_share: float = 0.5
-    contact_within_s: float = 5.0
-    stay_margin: float = 0.3
+    least_closing_mps: float = 0.35
+    least_cycling_mps: float = 1.8
+    pass_within_m: float = 7.8
+    pass_growth_mps: float = 0.65
+    stopping_share: float = 0.55
+    contact_within_s: float = 5.2
+    least_ahead_s: float = 0.3
+    stay_margin: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ def _holds(
     return np.asarray(
         (course.closing_mps > (1 - margin) * settings.least_closing_mps)
         & (course.pass_m < pass_limit)
+        & (course.pass_s > settings.least_ahead_s)
         & (unable | soon)
     )
 

@@ -27,18 +27,21 @@ def without_riders(rows: TrackRows, pairs: Pairs, fires: BoolArray) -> BoolArray
     index = fires.nonzero()[0]
     cyclist, pedestrian = pairs.cyclist_row[pairs.cyclist[index]], pairs.pedestrian_row[index]
     since_s = rows.time_s[cyclist] - (RIDER_S - EPSILON_S)
-    alike: BoolArray = np.ones(len(index), np.bool_)
+    apart_now = rows.xy_m[cyclist] - rows.xy_m[pedestrian]
+    # By the filter's velocities, or by what their distance really did: either may be disturbed.
+    difference = rows.velocity_mps[cyclist] - rows.velocity_mps[pedestrian]
+    steady = (difference**2).sum(-1) <= RIDER_MPS**2
     fires = fires.copy()
     while len(index):
         near = _near(rows, cyclist, pedestrian)
-        difference = rows.velocity_mps[cyclist] - rows.velocity_mps[pedestrian]
-        alike &= near & ((difference**2).sum(-1) <= RIDER_MPS**2)
+        moved = apart_now - (rows.xy_m[cyclist] - rows.xy_m[pedestrian])
+        alike = near & (steady | ((moved**2).sum(-1) <= (RIDER_MPS * RIDER_S) ** 2))
         old = rows.time_s[cyclist] <= since_s
         before = rows.previous[cyclist], rows.previous[pedestrian]
         young = ~old & ((before[0] < 0) | (before[1] < 0))
         fires[index[(old & alike) | (young & near)]] = False
         go = near & ~old & ~young
-        index, since_s, alike = index[go], since_s[go], alike[go]
+        index, since_s, apart_now, steady = index[go], since_s[go], apart_now[go], steady[go]
         cyclist, pedestrian = before[0][go], before[1][go]
     return fires
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -99,13 +100,14 @@ class PictureHealth:
             self._repeated = RepeatedPictures()
             self._judged_s = math.nan
         self._time_s = time_s
-        still_s = self._repeated.update(rgb, time_s)
+        reduced = lru_cache(maxsize=1)(lambda: reduce(rgb))  # once, for both checks
+        still_s = self._repeated.update(rgb, time_s, reduced)
         frozen = self._holds[0].update(still_s, _FROZEN_S, time_s)
         rest = self._verdicts[1:]
         if not time_s - self._judged_s < _EVERY_S * 0.99:
             passed_s = _EVERY_S if math.isnan(self._judged_s) else time_s - self._judged_s
             self._judged_s = time_s
-            rest = self._judge(reduce(rgb), passed_s, still_s)
+            rest = self._judge(reduced(), passed_s, still_s)
         self._verdicts = (frozen, *rest)
         return self._verdicts
 

@@ -8,13 +8,14 @@ frame beside it; real movement and sway are like those of the frames beside it, 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bikeped.monitor.reduced_picture import reduce
+from bikeped.monitor.reduced_picture import Reduced
 from bikeped.types import Float32Array, ImageArray
 
 _SIDE = 56  #: samples are taken at 56 x 56 places, in pairs of neighbours
@@ -42,14 +43,15 @@ class RepeatedPictures:
         self._new_s: deque[float] = deque(maxlen=2)
         self._repeats: deque[int] = deque(maxlen=2)
 
-    def update(self, rgb: ImageArray, time_s: float) -> float:
+    def update(self, rgb: ImageArray, time_s: float, reduced: Callable[[], Reduced]) -> float:
         """Seconds that brought at most one new picture; 0 while that is too few frames to tell.
 
-        One is let pass: an encoder draws a frozen picture anew at its next key frame.
+        One is let pass: an encoder draws a frozen picture anew at its next key frame. `reduced`
+        gives the picture's reduced copies, where they are needed.
         """
         samples = _samples(rgb)
         looped = self._looped(samples)
-        new, coarse = self._is_new(rgb, samples, looped)
+        new, coarse = self._is_new(reduced, samples, looped)
         self._last = samples
         if new or not self._new_s:
             self._kept.append((samples, coarse))
@@ -62,7 +64,7 @@ class RepeatedPictures:
         return max(0.0, time_s - self._new_s[0])
 
     def _is_new(
-        self, rgb: ImageArray, samples: ImageArray, looped: bool
+        self, reduced: Callable[[], Reduced], samples: ImageArray, looped: bool
     ) -> tuple[bool, ImageArray | None]:
         """Whether the picture is new, and its coarse copy where that was needed."""
         eps = min(max(_REPEAT_SHARE * self._usual, _EPS[0]), _EPS[1])
@@ -75,7 +77,7 @@ class RepeatedPictures:
         if self._noisy > _NOISY_SHARE:
             return nearest > eps and not looped, None
         # Without noise only movement makes a picture new, and samples may miss a small one.
-        coarse = reduce(rgb).coarse
+        coarse = reduced().coarse
         same = (
             other is not None and gap <= eps and cv2.norm(coarse, other, cv2.NORM_INF) <= _MOVED
             for gap, (_, other) in zip(apart, self._kept, strict=True)

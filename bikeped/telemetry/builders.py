@@ -164,6 +164,7 @@ def event_line(
             )
         ],
         sentence=decision.sentence,
+        detail=decision.detail,
         raw_state=_state(decision.state if decision.raw is None else decision.raw),
         latency_ms={stage: json_number(ms, 3) or 0.0 for stage, ms in latency_ms.items()},
     )

@@ -239,4 +239,5 @@ class EventLine(msgspec.Struct, frozen=True, kw_only=True):
     tracks: list[EventTrack]
     detections: list[EventDetection]
     sentence: str
+    detail: Annotated[str, Meta(description="the numbers that the rule compared")]
     latency_ms: Annotated[dict[str, float], Meta(description="by stage")]

@@ -44,6 +44,7 @@ class LiveSnapshot(msgspec.Struct, frozen=True):
     colour: str
     blink_hz: float
     sentence: str
+    detail: str
     decided: str | None
     faults: tuple[str, ...]
     signal_age_s: float | None  #: since the newest signal
@@ -140,6 +141,7 @@ class LiveState:
             colour="off" if signal is None else signal.colour.value,
             blink_hz=0.0 if signal is None else signal.blink_hz,
             sentence=self._sentence,
+            detail="" if decision is None else decision.detail,
             decided=None if decision is None else decision.state.name,
             faults=() if signal is None else fault_texts(signal.faults),
             signal_age_s=None if self._signal_s is None else now_s - self._signal_s,
@@ -205,8 +207,8 @@ def _pair_record(pair: PairMetrics | None) -> dict[str, float] | None:
     """`PairMetrics` by field name, the ids as `cyclist` and `pedestrian`."""
     if pair is None:
         return None
-    values = dataclasses.asdict(pair).items()
-    return {name.removesuffix("_id"): round(value, 4) for name, value in values}
+    values = {k: v for k, v in dataclasses.asdict(pair).items() if math.isfinite(v)}
+    return {name.removesuffix("_id"): round(value, 4) for name, value in values.items()}
 
 
 def _track_records(tracks: Tracks) -> list[LiveTrack]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 #: Which later piece of work closes the rows that are not expected to pass yet.
-RULE = "rule (a light that people believe)"
 EVIDENCE = "evidence"
 WORLD = "the world as it comes"
 HARDWARE = "the virtual pole (city)"

@@ -58,6 +58,11 @@ class Rig:
             self.result.repetitions = number + 1
             yield number
 
+    @property
+    def last(self) -> int:
+        """The number of the last repetition."""
+        return self._repeat - 1
+
     def measure(self, name: str, value: float) -> float:
         """Records a figure of the row's limit `name`; the worst one is kept."""
         limit = next(limit for limit in self.result.row.limits if limit.name == name)
@@ -292,6 +297,12 @@ class Supervisor:
                     return at_s
             time.sleep(0.02)
         return float("inf")
+
+    def as_after_an_hour(self) -> None:
+        """Forgets early ends and silences, which make the pauses of service and lamp grow."""
+        (self._folder / "state" / "starts.json").unlink(missing_ok=True)
+        command = [sys.executable, "-m", "bikeped.cli.main", "lamp", "reset", "-c", self._config]
+        subprocess.run(command, check=False, capture_output=True, cwd=self._folder)
 
     def _command(self, line: str) -> Sequence[str]:
         """A line of the unit with this machine's paths, run through `campaign.launch`."""

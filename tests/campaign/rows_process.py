@@ -66,6 +66,7 @@ def killed(rig: Rig) -> None:
         began_s = rig.fault(process.kill, wait_s=20)
         rig.not_reassuring(began_s + 1, supervisor.next_start(began_s))
         rig.measure("restart", supervisor.next_start(began_s) - began_s)
+        supervisor.as_after_an_hour()
         rig.ready(began_s + 1, name=None)
 
 
@@ -92,6 +93,7 @@ def stopped(rig: Rig) -> None:
             again_s = supervisor.next_start(began_s)
             rig.measure("restart", again_s - began_s)
             rig.not_reassuring(began_s + 1, again_s)
+        supervisor.as_after_an_hour()
         rig.ready(time.monotonic(), name=None)
 
 
@@ -181,6 +183,7 @@ def broken_configuration(rig: Rig) -> None:
         said = supervisor.log.read_text(errors="replace")
         rig.expect("last good" in said.lower(), "the log does not name the last good configuration")
         config.write_text(good)
+        supervisor.as_after_an_hour()
 
 
 @row(

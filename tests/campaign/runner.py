@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,12 @@ def figures(results: Iterable[Result]) -> list[dict[str, Any]]:
         } | {"limit": "; ".join(map(str, result.row.limits))}
         rows.append(values)
     return rows
+
+
+def from_figures(rows: Mapping[int, Row], data: Iterable[Mapping[str, Any]]) -> list[Result]:
+    """The results of an earlier run, from its `figures`."""
+    kept = ("worst", "failures", "seen", "repetitions", "took_s", "skipped")
+    return [Result(rows[one["row"]["number"]], **{k: one[k] for k in kept}) for one in data]
 
 
 def run(rows: Sequence[Row], repeat: int | None, console: Console) -> list[Result]:

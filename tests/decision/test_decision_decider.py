@@ -144,12 +144,17 @@ def test_an_alert_says_who_how_far_and_since_when(rule):
         "cyclist 7", "pedestrian 3", "11.20 m", "11.60 m 0.07 s ago", "moved 0.40 m", "6.0 m/s",
         "1.9 to 24.8 m", f"rule {rule}",
     ):  # fmt: skip
-        assert part in decision.sentence
+        assert part in decision.detail
+    assert decision.sentence == (
+        "ALERT: a cyclist and a pedestrian are 11 m apart and closing; together in 1.7 s."
+        if decision.pair.contact_s < 9
+        else "ALERT: a cyclist and a pedestrian are 11 m apart and not closing."
+    )
 
 
 def test_other_states_say_why():
     alert = sentence_of(replace(SELECTED, rule="distance"), ride([5.0, 5.0]))
-    assert "5.00 m apart, within 1.9 to 24.8 m (rule distance)" in alert.sentence
+    assert "5.00 m apart, within 1.9 to 24.8 m (rule distance)" in alert.detail
     cases = [
         ([1.5, 1.0], {}, "1.00 m apart, nearer than the 1.9 m"),
         ([9.0, 9.0], {"d_max_m": 5.0}, "9.00 m apart, farther than 5.0 m"),
@@ -164,17 +169,17 @@ def test_other_states_say_why():
             replace(SELECTED, speed_adaptive=False, count_all=True, **changes), ride(ys)
         )
         assert decision.state is State.WARNING
-        assert part in decision.sentence
+        assert part in decision.detail
     gone = sentence_of(
         SELECTED, [*ride([9.0]), (1.5, {3: (PEDESTRIAN, 0, 0), 4: (PEDESTRIAN, 1, 0)})]
     )
-    assert "2 pedestrians are tracked" in gone.sentence
-    assert "a cyclist was 1.5 s ago" in gone.sentence
+    assert "2 pedestrians are tracked" in gone.detail
+    assert "a cyclist was 1.5 s ago" in gone.detail
     assert gone.pair is None
     safe = sentence_of(SELECTED, [(0.0, {3: (PEDESTRIAN, 0.0, 0.0)})])
-    assert "1 pedestrian is tracked" in safe.sentence
-    assert "last 1.9 s" in safe.sentence
-    assert sentence_of(SELECTED, [(0.0, {})]).sentence == "IDLE: no pedestrian is tracked."
+    assert "1 pedestrian is tracked" in safe.detail
+    assert "last 1.9 s" in safe.detail
+    assert sentence_of(SELECTED, [(0.0, {})]).detail == "IDLE: no pedestrian is tracked."
 
 
 def test_a_warning_names_the_nearest_pair():

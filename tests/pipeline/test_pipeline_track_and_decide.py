@@ -106,6 +106,7 @@ def test_the_speed_window_reaches_the_rule(frames, speed_mps):
             "tracking.measurement_noise_cyclist_m=0.00001",  # a track is where it was seen
             "tracking.confirm_hits=1",
             "decision.lookback_frames=1",
+            "decision.rule=pairwise",
         ],
     )
     track_and_decide = TrackAndDecide(loaded)

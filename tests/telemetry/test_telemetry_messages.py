@@ -228,7 +228,7 @@ def test_event_line_exactly_and_in_order():
         b'{"id":3,"kind":"pedestrian","x":3.0,"y":4.0,"vx":0.0,"vy":0.0,"lost":true},'
         b'{"id":7,"kind":"cyclist","x":0.0,"y":12.346,"vx":3.0,"vy":-4.0,"lost":false}],'
         b'"detections":[{"kind":"cyclist","confidence":0.1,"box":[1.0,2.1,3.0,4.0]}],'
-        b'"sentence":"Cyclist 7 comes towards pedestrian 3.",'
+        b'"sentence":"Cyclist 7 comes towards pedestrian 3.","detail":"",'
         b'"latency_ms":{"pre":1.235,"total":20.0}}\n'
     )
     assert m.parse_event(line) == event_line()

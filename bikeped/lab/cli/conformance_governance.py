@@ -26,21 +26,32 @@ if TYPE_CHECKING:
 candidate_argument = click.argument("candidate", type=click.Path(path_type=Path))
 
 
+traffic_option = click.option(
+    "--traffic",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Scenes of your own, as `conformance traffic` reads them, for the nuisance gate, too.",
+)
+
+
 @click.command("gate")
 @candidate_argument
 @suite_options
-def gate(run: SuiteRun, candidate: Path) -> int:
-    """Check the deployment gates (sensitivity, specificity, warning budget) for the decision
-    section of CANDIDATE.
+@traffic_option
+def gate(run: SuiteRun, candidate: Path, traffic: Path | None) -> int:
+    """Check the deployment gates for the decision section of CANDIDATE: the paper's (sensitivity,
+    specificity, warning budget) and nuisance (red and alerts beside a light that knows danger).
 
     The camera is that of the configuration (-c). Exit status 1 when a gate does not hold.
     """
     from bikeped.config.provenance import decision_hash
     from bikeped.lab.governance.gates import all_hold, check_gates
+    from bikeped.lab.governance.nuisance import grouped, nuisance_gates
 
     run, decision = _candidate(run, candidate)
     metrics = run.suite.measure(decision)
-    gates = check_gates(metrics)
+    nuisance = nuisance_gates(run.loaded, decision, run.tracker, traffic)
+    gates = [*check_gates(metrics), *nuisance]
     run.write_json(
         {
             "candidate": str(candidate),
@@ -51,6 +62,8 @@ def gate(run: SuiteRun, candidate: Path) -> int:
             "scenarios": len(run.suite.scenarios),
             "gates": [g.as_dict() for g in gates],
             "holds": all_hold(gates),
+            "holds_by_kind": grouped(gates),
+            "tracker": run.tracker,
             "metrics": metrics.as_dict(),
         }
     )
@@ -66,7 +79,8 @@ def gate(run: SuiteRun, candidate: Path) -> int:
     type=click.Path(path_type=Path),
     help="The optimiser's JSON that the candidate came from; its hash is recorded.",
 )
-def promote(run: SuiteRun, candidate: Path, trace: Path | None) -> int:
+@traffic_option
+def promote(run: SuiteRun, candidate: Path, trace: Path | None, traffic: Path | None) -> int:
     """Write the decision section of CANDIDATE into the configuration file, if all gates hold.
 
     The previous file stays as FILE.bak. FILE.provenance.json records what the section rests on;
@@ -74,14 +88,16 @@ def promote(run: SuiteRun, candidate: Path, trace: Path | None) -> int:
     """
     from bikeped.lab.governance.gates import all_hold, check_gates, provenance_record
     from bikeped.lab.governance.gates import promote as write
+    from bikeped.lab.governance.nuisance import nuisance_gates
 
     path = run.config_path or Path("config.yaml")
     run, decision = _candidate(replace(run, config_path=path), candidate, camera_options=False)
     suite, loaded = run.suite, run.loaded
     metrics = suite.measure(decision)
-    gates = check_gates(metrics)
+    nuisance = nuisance_gates(loaded, decision, run.tracker, traffic)
+    gates = [*check_gates(metrics), *nuisance]
     files = [("candidate", candidate)] + ([("trace", trace)] if trace is not None else [])
-    record = provenance_record(suite, decision, metrics, loaded, files)
+    record = provenance_record(suite, decision, metrics, gates, loaded, files)
     print_gates(f"{candidate} on {count(len(suite.scenarios))}", gates, run.console)
     if not all_hold(gates):
         run.write_json({"promoted": False, **record})
@@ -244,11 +260,17 @@ def count(scenarios: int) -> str:
 def print_gates(title: str, gates: list[Gate], out: Console) -> None:
     """Required and measured, and in one line what fails."""
     rows = [
-        (g.name, g.rule, g.format_value(g.measured), "yes" if g.holds else Text("NO", style="bold"))
+        (
+            g.kind,
+            g.name,
+            g.rule,
+            g.format_value(g.measured),
+            "yes" if g.holds else Text("NO", style="bold"),
+        )
         for g in gates
     ]
-    columns = ("Gate", "Required", "Measured", "Holds")
-    out.print(text_table(columns, rows, align="llll", title=title))
+    columns = ("Kind", "Gate", "Required", "Measured", "Holds")
+    out.print(text_table(columns, rows, align="lllll", title=title))
     failed = [
         f"{g.name.lower()} {g.format_value(g.measured)}, required {g.rule}"
         for g in gates

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -46,8 +46,9 @@ BUDGET_ABOVE_S = PEDESTRIAN_PRT_S
 class Gate:
     """One gate: `measured` is NaN where there was nothing to measure, and then it does not hold.
 
-    `strict`: the measured figure must exceed `required`, not only reach it. `unit` is `%` (the
-    figures are shares) or `s`.
+    `strict`: the measured figure must exceed `required`, not only reach it; `at_most`: it must not
+    exceed it. `unit` is `%` (the figures are shares), `s` or `x` (a ratio). `kind`: one of the
+    paper's gates, or of nuisance (`lab.governance.nuisance`).
     """
 
     name: str
@@ -56,6 +57,8 @@ class Gate:
     unit: str
     measured: float
     holds: bool
+    kind: Literal["paper", "nuisance"] = "paper"
+    at_most: bool = False
 
     def format_value(self, value: float) -> str:
         """A value in the gate's unit; one that fails never reads like one that holds.
@@ -66,15 +69,20 @@ class Gate:
             return "nothing to measure"
         scale, digits = (100.0, 1) if self.unit == "%" else (1.0, 2)
         rounded = round(value * scale, digits)
-        while value < self.required and rounded >= round(self.required * scale, digits):
+        required = round(self.required * scale, digits)
+        while value < self.required and rounded >= required and not self.at_most:
             digits += 1
             rounded = math.floor(value * scale * 10**digits) / 10**digits
+        while self.at_most and value > self.required and rounded <= required:
+            digits += 1
+            rounded = math.ceil(value * scale * 10**digits) / 10**digits
         return f"{rounded:.{digits}f} {self.unit}"
 
     @property
     def rule(self) -> str:
         """The requirement in words."""
-        return f"{'above' if self.strict else 'at least'} {self.format_value(self.required)}"
+        relation = "at most" if self.at_most else "above" if self.strict else "at least"
+        return f"{relation} {self.format_value(self.required)}"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -105,7 +113,7 @@ def check_gate_figures(figures: Mapping[str, Any]) -> list[Gate]:
     ]
 
 
-def all_hold(gates: list[Gate]) -> bool:
+def all_hold(gates: Sequence[Gate]) -> bool:
     """Whether a configuration may be promoted."""
     return all(gate.holds for gate in gates)
 
@@ -123,6 +131,7 @@ def provenance_record(
     suite: Suite,
     decision: DecisionConfig,
     metrics: Metrics,
+    gates: Sequence[Gate],
     loaded: LoadedConfig,
     files: Sequence[tuple[str, Path]] = (),
 ) -> dict[str, Any]:
@@ -151,7 +160,7 @@ def provenance_record(
         "code_hash": code_hash(DECIDING_CODE),
         "measuring_code_hash": code_hash((*DECIDING_CODE, *MEASURING_CODE)),
         "metrics": metrics.as_dict(),
-        "gates": [gate.as_dict() for gate in check_gates(metrics)],
+        "gates": [gate.as_dict() for gate in gates],
         "files": {role: {"name": path.name, "sha256": file_hash(path)} for role, path in files},
     }
 

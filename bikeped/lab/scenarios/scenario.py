@@ -141,7 +141,7 @@ def load_scenarios(folder: Path) -> list[Scenario]:
     `street`, where there is no such folder, are the bundled scenes of an ordinary street.
     """
     if folder == Path("street") and not folder.exists():
-        folder = Path(__file__).parent / "street"
+        folder = street_folder()
     if not folder.is_dir():
         raise ScenarioError(f"{folder}: is not a folder of scenario files; check --scenarios")
     files = sorted(p for p in folder.iterdir() if p.suffix in {".yaml", ".yml"})
@@ -157,6 +157,11 @@ def load_scenarios(folder: Path) -> list[Scenario]:
             )
         seen[scenario.name] = scenario.source
     return scenarios
+
+
+def street_folder() -> Path:
+    """Folder of the bundled scenes of an ordinary street."""
+    return Path(__file__).parent / "street"
 
 
 def bundled_folder() -> Path:

@@ -60,7 +60,7 @@ CONFIGURATIONS: dict[str, DecisionConfig] = {
     ),
     "naive_closing": DecisionConfig(rule="naive"),
     "ttc": DecisionConfig(rule="ttc", min_displacement_m=0),
-    "predictive": DecisionConfig(rule="predictive"),
+    "predictive": DecisionConfig(rule="predictive", max_range_m=27.0),
 }
 
 

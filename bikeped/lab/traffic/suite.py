@@ -86,11 +86,15 @@ class TrafficSuite:
 
     @staticmethod
     def of_scenarios(
-        scenarios: Iterable[Scenario], loaded: LoadedConfig, noise: Noise, seed: int
+        scenarios: Iterable[Scenario],
+        loaded: LoadedConfig,
+        noise: Noise,
+        seed: int,
+        tracker: TrackerName = "deployed",
     ) -> TrafficSuite:
         """Scripted or random scenarios as the conformance simulation has them, seen everywhere."""
         scenes = [TrafficScene(scenario, SIMULATION_POSE) for scenario in scenarios]
-        suite = TrafficSuite.load(scenes, loaded, noise, seed)
+        suite = TrafficSuite.load(scenes, loaded, noise, seed, tracker)
         return replace(suite, view_m=None, seen_m=None)
 
     def with_noise(self, noise: Noise, seed: int, delay_frames: int = 0) -> TrafficSuite:

@@ -89,6 +89,7 @@ function onNow(data) {
   lostSince = null;
   radar.setLive(true);
   showState(data.signal, data.sentence || STATES[data.signal] || data.signal);
+  $("#state-sentence").title = data.detail; // the test's numbers, one step away
   setText($("#light-now"), lightWords(data));
   $("#state-facts").hidden = false;
   showPair(data);

@@ -146,7 +146,7 @@ def test_sentences_and_states_are_the_pole_s_own(work, name, rule):
             rows.velocity_mps[at],
             rows.counts[at],
         )
-        assert side["sentence"][frame] == told.sentence
+        assert side["sentence"][frame] == told.detail
         assert State(side["state"][frame]) is told.state
         chosen = side["chosen"][frame]
         pairs = side["pairs"]

@@ -76,6 +76,7 @@ function whyNot(side, pair) {
   if (!passes.far_enough) return "too near for a warning to help";
   if (!passes.near_enough) return "too far apart to matter yet";
   if (!passes.in_range) return "too far from the camera to be judged";
+  if (side.decision.rule === "predictive") return "they are not on course to meet";
   if (!passes.judged) return "one of them has only just appeared";
   if (side.decision.rule === "ttc") return passes.closing ? "they would not meet soon" : "not getting closer";
   if (!passes.closing) return "not getting closer";
