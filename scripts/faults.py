@@ -30,7 +30,9 @@ def main() -> int:
     parser.add_argument("numbers", nargs="*", type=int, metavar="N", help="rows; all without")
     parser.add_argument("--repeat", type=int, metavar="K", help="repetitions of each row")
     parser.add_argument("--json", type=Path, help="file for the figures")
-    parser.add_argument("--also", type=Path, nargs="+", default=(), help="figures of other runs")
+    parser.add_argument(
+        "--also", type=Path, nargs="+", default=(), help="figures of other runs, the first counts"
+    )
     parser.add_argument("--page", type=Path, help="write the page here, whatever ran")
     arguments = parser.parse_args()
     unknown = [number for number in arguments.numbers if number not in known]
@@ -45,6 +47,7 @@ def main() -> int:
     for path in arguments.also:
         found = runner.from_figures(known, json.loads(path.read_text(encoding="utf-8")))
         results += [result for result in found if result.row.number not in ran]
+        ran |= {result.row.number for result in found}
     results.sort(key=lambda result: result.row.number)
     console.print(runner.table(results))
     if arguments.json:
